@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from go1exp.config.schema.registry import members
-from go1exp.gap.search import tolerances
-from go1exp.gap.search.alike import LEVEL, differ
+from go1exp.gap.search import thresholds, tolerances
+from go1exp.gap.search.alike import differ
 from go1exp.sim.effects.tolerances import declared
 
 TOLERANCE = declared(("encoder_offset", "offset")).tolerance
@@ -59,7 +59,7 @@ def test_causes_that_are_alike_are_refused_no_more_often_than_said(spread: float
     sd = 0.001 * rng.uniform(0.3, 3.0, 12)
     true = 0.009 + spread * TOLERANCE * (np.arange(12) % 2)
     trials = [differ(true + sd * rng.standard_normal(12), drawn(true, sd, k), TOLERANCE) for k in range(300)]
-    assert np.mean(trials) <= LEVEL + 0.02
+    assert np.mean(trials) <= thresholds.SHARED_LEVEL + 0.02
 
 
 def test_what_one_fault_may_give_to_all_joints_is_known_of_the_effects_themselves() -> None:

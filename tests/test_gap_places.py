@@ -11,8 +11,8 @@ import pytest
 
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.score.linear import Layout
-from go1exp.gap.search import evidence, places, reduction, tolerances
-from go1exp.gap.search.screen import SHARES, Motion, Screened, Variant, library, rivals
+from go1exp.gap.search import evidence, places, reduction, thresholds, tolerances
+from go1exp.gap.search.screen import Motion, Screened, Variant, library, rivals
 from go1exp.gap.search.tolerances import Freedom
 from go1exp.gap.search.trial import _choice
 from go1exp.robot import JOINTS
@@ -191,7 +191,7 @@ def test_a_limit_of_the_torque_is_looked_for_below_what_was_asked_for(demand: fl
     probes = [p for v in library(MACHINE, motion) if v.effect == "torque_speed_limit" for p in v.probes]
     peaks = [1.0 + p.delta for p in probes if p.key == ("torque_speed_limit", "peak")]
     thighs = [peak[1] for peak in peaks if (peak < 1.0).sum() == 4 and peak[1] < 1.0]  # part by part
-    assert len(thighs) == len(SHARES)
+    assert len(thighs) == len(thresholds.TORQUE_SHARES)
     assert len({p for p in thighs if p < max(min(demand, 1.0), 0.2) + 1e-9}) >= (4 if demand > 1.0 else 1)
     assert max(thighs) <= 0.95 + 1e-9
 

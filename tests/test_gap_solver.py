@@ -23,7 +23,7 @@ from go1exp.gap.result import EXIT_CODES, GapResult, GapSettings
 from go1exp.gap.robots.hung import HungGo1, hung
 from go1exp.gap.score.likelihood import gram
 from go1exp.gap.score.linear import Layout, predicted
-from go1exp.gap.search import significance, stepwise, strain
+from go1exp.gap.search import significance, stepwise, strain, thresholds
 from go1exp.gap.search.fit import Model, scores
 from go1exp.gap.search.significance import max_t
 from go1exp.gap.search.tolerances import Bounds, Freedom, solve
@@ -283,7 +283,7 @@ def test_few_windows_are_enough_for_what_removes_most_of_a_gap(
 
 def test_what_strains_most_is_tried_with_its_rivals() -> None:
     relief = {"armature": 900.0, "link_mass": 200.0, "strength": 100.0}
-    values = 900.0 / (2.0 * strain.STRAIN)
+    values = 900.0 / (2.0 * thresholds.ACTIVE_BOUND)
     assert strain.straining(relief, values, []) == ["armature"]
     assert strain.straining(relief, 3.0 * values, []) == []
     assert strain.straining(relief, values, ["armature"]) == []  # 200 is too little

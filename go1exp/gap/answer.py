@@ -10,30 +10,21 @@ from typing import Literal
 import numpy as np
 
 from go1exp.config.schema.registry import members
-from go1exp.gap.certainty import HALF, beside_a_gap, doubt, widened
+from go1exp.gap.certainty import beside_a_gap, doubt, widened
 from go1exp.gap.replay.rows import Key, Theta
 from go1exp.gap.result import Candidate, NamedEffect, Verdict
 from go1exp.gap.robots.fixed_base import FixedBase
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score import angle_errors
 from go1exp.gap.score.robust import excess, removed
-from go1exp.gap.search import reduction, tolerances
+from go1exp.gap.search import reduction, thresholds, tolerances
 from go1exp.gap.search.evidence import beyond, bounded, deviation, inaudible
 from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.last_fit import resampled_values
 from go1exp.gap.search.ledger import LastCheck
-from go1exp.gap.search.stepwise import SILENT, Search
+from go1exp.gap.search.stepwise import Search
 from go1exp.sim.effects.base import Param
 from go1exp.sim.effects.tolerances import Tolerances, declared, sizes
-
-QUANTILES = (0.025, 0.975)
-"""Of a 95 % interval."""
-
-MOST_WINDOWS = 0.9
-"""Share of the held-out windows that must be within what the user accepts (chosen: one in ten may be off)."""
-
-MUCH = 0.5
-"""Share of the largest deviation of a term from which a joint is named although its interval reaches the tolerance."""
 
 
 def can_stand(robot: Robot) -> bool:
@@ -43,7 +34,7 @@ def can_stand(robot: Robot) -> bool:
 
 def not_excited(signal: Mapping[str, float], held: bool = True) -> dict[str, str]:
     """Return effects that these data cannot show, and the excitation that would; ``held``: a trunk is that has feet."""
-    silent = [effect for effect, loud in signal.items() if loud < SILENT]
+    silent = [effect for effect, loud in signal.items() if loud < thresholds.NOT_EXCITED]
     unfelt = [effect for effect in members("effect") if held and tolerances.identification(effect).needs_ground]
     return {effect: tolerances.identification(effect).excitation for effect in (*silent, *unfelt)}
 
@@ -79,7 +70,7 @@ def concluded(search: Search, warnings: list[str]) -> Answer:
     settings = search.settings
     plain = excess(search.state.held_out({}))
     check = search.last_check()
-    if search.state.terms and not check.helps and removed(search.first, search.steps[-1][1]) <= HALF:
+    if search.state.terms and not check.helps and removed(search.first, search.steps[-1][1]) <= thresholds.HALF:
         warnings.append(f"Withdrawn, since the last check does not bear it out: {', '.join(search.state.terms)}.")
         search.withdraw("the last check does not bear it out")
     theta, drawn = resampled_values(search)
@@ -98,11 +89,11 @@ def concluded(search: Search, warnings: list[str]) -> Answer:
         search.withdraw(f"the tolerances suffice, and {why}")
         final, theta, named = search.first, search.state.theta, ()
     within = share_accepted(search)
-    verdict = decide(search, named, final, within >= MOST_WINDOWS)
+    verdict = decide(search, named, final, within >= thresholds.ACCEPTED_WINDOWS)
     reached = {"null": plain, "box": first, "final": final}
     if len(search.splits.confirm):
         confirmed = reached["confirm"] = excess(search.state.held_out(windows=search.splits.confirm))
-        beyond = confirmed > 2.0 * settings.adequate and not within >= MOST_WINDOWS
+        beyond = confirmed > 2.0 * settings.adequate and not within >= thresholds.ACCEPTED_WINDOWS
         if named and verdict == "explained" and beyond:
             verdict = "partly explained"
             warnings.append(f"On windows kept for a last check the error is {1 + confirmed:.3g} times the floor.")
@@ -180,7 +171,7 @@ def _joints_beyond(
     beyond = np.zeros(len(joints), dtype=bool)
     for key in keys:
         p = known.param(key)
-        low, high = np.quantile(drawn[key], QUANTILES, axis=0)
+        low, high = np.quantile(drawn[key], thresholds.QUANTILES, axis=0)
         beyond |= (deviation(theta, key, known) > 1.0) & ((low > p.null) | (high < p.null))
     return tuple(j for j, b in zip(joints, beyond, strict=True) if b)
 
@@ -205,11 +196,11 @@ def weak_joints(search: Search, effect: str, theta: Theta, drawn: Mapping[Key, n
     for key in sizes(effect):
         p = known.param(key)
         if p.per == "joint":
-            low, high = np.quantile(drawn[key], QUANTILES, axis=0)
+            low, high = np.quantile(drawn[key], thresholds.QUANTILES, axis=0)
             away = np.broadcast_to(deviation(theta, key, known), len(joints))
             sure = (low > p.null + p.tolerance) | (high < p.null - p.tolerance)
             outside |= away > 1.0
-            strong |= (away > 1.0) & (sure | (away >= MUCH * away.max()))
+            strong |= (away > 1.0) & (sure | (away >= thresholds.MUCH * away.max()))
     return tuple(int(j) for j in np.flatnonzero(outside & ~strong))
 
 
@@ -263,7 +254,7 @@ def _intervals(
     """Return the 95 % intervals of a parameter by joint (those of ``at``), or by ``robot``; each holds the value."""
     count, kept = _named_places(param.per, joints, at)
     values = np.broadcast_to(np.ravel(value), count)
-    low, high = (np.broadcast_to(v, count) for v in np.quantile(samples, QUANTILES, axis=0))
+    low, high = (np.broadcast_to(v, count) for v in np.quantile(samples, thresholds.QUANTILES, axis=0))
     low, high = widened(values, np.minimum(low, values), np.maximum(high, values), param.null, unsure)
     low, high = np.maximum(low, param.low), np.minimum(high, param.high)
     return {name: (float(low[k]), float(high[k])) for k, name in kept.items()}
@@ -282,7 +273,7 @@ def decide(search: Search, named: Sequence[NamedEffect], final: float, accepted:
         accepted: whether what remains is within what the user does not care about.
     """
     settings, first = search.settings, search.first
-    loud = [effect for effect, s in search.signal.items() if s >= SILENT]
+    loud = [effect for effect, s in search.signal.items() if s >= thresholds.NOT_EXCITED]
     if named:
         certain = not settings.bootstraps or any(n.status == "certified" for n in named)
         return "explained" if accepted or (certain and final <= settings.adequate) else "partly explained"
@@ -293,7 +284,7 @@ def decide(search: Search, named: Sequence[NamedEffect], final: float, accepted:
 
 def evidence(search: Search) -> tuple[Candidate, ...]:
     """Return the candidates, best first, with those that the data cannot show."""
-    quiet = inaudible(search.signal, SILENT, [c.effect for c in search.candidates])
+    quiet = inaudible(search.signal, thresholds.NOT_EXCITED, [c.effect for c in search.candidates])
     accepted = {c.effect for c in search.candidates if c.status == "accepted"} - set(search.state.terms)
     kept = [
         replace(c, status="rejected", reason="dropped: the other terms do as well without it")

@@ -9,31 +9,10 @@ import numpy as np
 
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.score.robust import excess, removed
+from go1exp.gap.search import thresholds
 from go1exp.gap.search.evidence import at_bound
 from go1exp.gap.search.ledger import LastCheck, Ledger
 from go1exp.sim.effects.tolerances import sizes
-
-MOST = 0.75
-"""Share of the excess that is there without a term, and that it must remove, to be certified although a gap remains."""
-
-HALF = 0.5
-"""Share of the excess that is most of it: what removes more is not withdrawn, and must remove as much on the last check
-to be certified."""
-
-MAJORITY = 0.5
-"""Share of the resamples in which a term must be named again to be certified where the terms close a gap that the
-tolerances leave; elsewhere it is ``certified`` of the settings. Of sealed effects that were named in 60 to 78 % of them
-and closed the gap all five were right; of those beside a gap neither of two (12 and 68 %)."""
-
-ASTRAY = 0.4
-"""Relative standard deviation of a term's values beside a gap that remains, for each unit of the error's amplitude that
-the term leaves of what there is without it: what makes the rest may act as the term does. Chosen on sealed effects
-that were named beside a gap (84 values of seven cases): where 15, 25 and 75 % of the amplitude remained, errors were 7,
-10 and 44 %, of which resamples explain 5. Without it 73 % of the truths lay in the intervals of certified terms, and
-31 % in those of others."""
-
-HALF_WIDTH = 1.96
-"""Of a 95 % interval, in standard deviations."""
 
 
 def on_bound(search: Ledger, effect: str, theta: Theta, joints: Sequence[str]) -> str:
@@ -75,10 +54,10 @@ def doubt(search: Ledger, effect: str, theta: Theta, joints: Sequence[str], adeq
     rivals = [name for name in search.aliases.get(effect, ()) if name != effect]
     if not check.helps:
         return "the last check does not bear it out"
-    if not math.isnan(check.closed) and check.closed < HALF:
+    if not math.isnan(check.closed) and check.closed < thresholds.HALF:
         return f"on the last check only {max(check.closed, 0.0):.0%} of the excess goes"
     closes = adequate and search.first > search.settings.adequate
-    if stable < (min(MAJORITY, search.settings.certified) if closes else search.settings.certified):
+    if stable < (min(thresholds.MAJORITY, search.settings.certified) if closes else search.settings.certified):
         return f"it is named again in {stable:.0%} of the resamples only"
     if not joints and any(search.state.tolerances.param(key).per == "joint" for key in sizes(effect)):
         return "it leaves its tolerance at no joint beyond doubt"
@@ -88,7 +67,7 @@ def doubt(search: Ledger, effect: str, theta: Theta, joints: Sequence[str], adeq
         return "the tolerances do nearly as well, and at one joint many effects act alike"
     if adequate:
         return ""
-    if not alone > MOST:  # NaN too
+    if not alone > thresholds.BESIDE_GAP_SHARE:  # NaN too
         share = "less" if math.isnan(alone) else f"{max(alone, 0.0):.0%}"
         return f"a gap remains, and of what there is without it, it removes only {share}"
     return f"a gap remains, and {' and '.join(rivals)} would do as well" if rivals else ""
@@ -104,7 +83,7 @@ def beside_a_gap(search: Ledger, effect: str) -> float:
     goes = search.removes(effect)
     if math.isnan(goes):
         goes = removed(search.first, excess(search.select_chi2))
-    return HALF_WIDTH * ASTRAY * math.sqrt(min(max(1.0 - goes, 0.0), 1.0))
+    return thresholds.HALF_WIDTH * thresholds.BIAS_SD * math.sqrt(min(max(1.0 - goes, 0.0), 1.0))
 
 
 def widened(

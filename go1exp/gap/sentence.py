@@ -9,10 +9,9 @@ from itertools import combinations
 import numpy as np
 
 from go1exp.gap.answer import Answer
-from go1exp.gap.certainty import HALF
 from go1exp.gap.result import NamedEffect, Verdict
 from go1exp.gap.score.robust import removed
-from go1exp.gap.search import tolerances
+from go1exp.gap.search import thresholds, tolerances
 from go1exp.gap.search.evidence import deviation
 from go1exp.gap.search.screen import free_shapes
 from go1exp.gap.search.stepwise import Search
@@ -111,7 +110,7 @@ def _nearest(search: Search) -> str:
     tried = [c for c in search.candidates if c.stage == 1 and math.isfinite(c.excess_after)]
     near = min(tried, key=lambda c: c.excess_after, default=None)
     share = removed(search.first, near.excess_after) if near else 0.0
-    if near is None or share <= HALF:
+    if near is None or share <= thresholds.HALF:
         return "and no effect of the library explains it."
     title = f"{effect_class(near.effect).title} ({near.effect})"
     return f"of which {title} takes {share:.0%} away and yet is not named: {near.reason}."

@@ -14,16 +14,10 @@ from dataclasses import replace
 import numpy as np
 
 from go1exp.gap.score.linear import table
-from go1exp.gap.search import tolerances
+from go1exp.gap.search import thresholds, tolerances
 from go1exp.gap.search.fit import Model
 from go1exp.gap.search.last_fit import bootstrapped
 from go1exp.gap.search.state import State
-
-DRAWS = 200
-"""Resamples from which errors are read."""
-
-LEVEL = 0.05
-"""Share of causes that are alike, to just one tolerance, that are refused at most."""
 
 
 def differ(values: np.ndarray, drawn: np.ndarray, tolerance: float) -> bool:
@@ -44,7 +38,7 @@ def differ(values: np.ndarray, drawn: np.ndarray, tolerance: float) -> bool:
     errors = drawn - drawn.mean(axis=0)
     apart = np.abs(errors[:, one] - errors[:, other])
     scale = np.sqrt((apart**2).mean(axis=0)) + 1e-9 * tolerance
-    return bool((beyond / scale).max() > np.quantile((apart / scale).max(axis=1), 1.0 - LEVEL))
+    return bool((beyond / scale).max() > np.quantile((apart / scale).max(axis=1), 1.0 - thresholds.SHARED_LEVEL))
 
 
 def may_be(model: Model, state: State) -> bool:
@@ -62,7 +56,7 @@ def may_be(model: Model, state: State) -> bool:
     windows, probes = state.splits.train, tolerances.probes(state.machine, model.keys, model.theta)
     linear = table(state.scorer, model.theta, windows, probes, state.dt)
     chi2, rng = state.scorer.chi2(linear.residual, windows), np.random.default_rng(state.settings.seed)
-    draws = list(bootstrapped(state, linear, chi2, rng, DRAWS, nominal=False))
+    draws = list(bootstrapped(state, linear, chi2, rng, thresholds.SHARED_DRAWS, nominal=False))
     return not any(
         differ(model.theta[key], np.stack([draw[key] for draw in draws]), known.param(key).tolerance)
         for key in parameters

@@ -20,18 +20,9 @@ from go1exp.gap.score.angle_errors import of_angles
 from go1exp.gap.score.initial_state import rescaled
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.robust import log_chi2
-from go1exp.gap.search import significance
+from go1exp.gap.search import significance, thresholds
 from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.stepwise import Search
-
-TERMS = 2
-"""Most terms that are found by each clock before the two are compared: the first ones close most of a gap."""
-
-RESAMPLES = 4000
-"""Of the interval."""
-
-QUANTILES = (0.025, 0.975)
-"""Of a 95 % interval."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +47,7 @@ def contest(
     """Fit the model by both clocks on one half of the windows, judge both on the other, and the other way round.
 
     A clock is taken if the sign-flip test over stretches of neighbouring windows is significant (``settings.alpha``),
-    the mean of log chi2 differs by more than what means the same (``significance.SAME``), and the model without terms
+    the mean of log chi2 differs by more than what means the same (``SAME_GAIN``), and the model without terms
     does not significantly want the other one. Otherwise it is not decided, and the default is taken.
 
     Args:
@@ -65,7 +56,7 @@ def contest(
         settings: of the search.
         on_progress: called with what is being done, and which share of the work is finished.
     """
-    asked = dataclasses.replace(settings, max_terms=min(TERMS, settings.max_terms), bootstraps=0)
+    asked = dataclasses.replace(settings, max_terms=min(thresholds.CLOCK_TERMS, settings.max_terms), bootstraps=0)
     halves = (parts, dataclasses.replace(parts, train=parts.select, select=parts.train))
     nominal, last = _Judged(), _Judged()
     terms: dict[Clock, dict[str, None]] = {name: {} for name in sides}
@@ -108,7 +99,7 @@ def contest(
 def decided(choice: ClockChoice, alpha: float) -> ClockChoice:
     """Return a choice with the clock that its figures prefer, or with why they prefer none."""
     reason = ""
-    if abs(choice.gain) <= significance.SAME:
+    if abs(choice.gain) <= thresholds.SAME_GAIN:
         reason = "the two do as well"
     elif choice.p >= alpha:
         reason = f"the difference is not significant (p = {choice.p:.2g} of {choice.stretches} stretches)"
@@ -131,9 +122,9 @@ def judged(
     difference = log_chi2_of["recorded"] - log_chi2_of["speeds"]
     total = np.array([difference[stretch == u].sum() for u in units])
     count = np.array([np.sum(stretch == u) for u in units])
-    drawn = rng.integers(0, len(units), (RESAMPLES, len(units)))
+    drawn = rng.integers(0, len(units), (thresholds.CLOCK_RESAMPLES, len(units)))
     means = total[drawn].sum(1) / count[drawn].sum(1)
-    low, high = np.quantile(means, QUANTILES)
+    low, high = np.quantile(means, thresholds.QUANTILES)
     p = significance.max_t(np.stack([total, -total]), rng).min()
     return float(difference.mean()), (float(low), float(high)), float(p)
 
@@ -175,9 +166,6 @@ class _Judged:
 OF_CLOCK: dict[Clock, str] = {"recorded": "written times", "speeds": "times from the speeds"}
 """Clock -> what it is called in a sentence."""
 
-UNEVEN = 0.1
-"""Difference of the quantiles of the steps, in medians, from which written times are called uneven."""
-
 
 def sentence(choice: ClockChoice) -> str:
     """Return in words which clock was taken, by how much it is better, and how sure that is."""
@@ -202,7 +190,7 @@ def details(choice: ClockChoice) -> str:
         rates = [f"{span(*rate)} Hz by {OF_CLOCK[name]}" for name, rate in choice.rate_hz.items()]
         sentences.append(f"Rows come at {' and '.join(rates)}.")
     low, high = choice.steps
-    if high - low > UNEVEN:
+    if high - low > thresholds.UNEVEN_CLOCK:
         sentences.append(f"The written times are uneven: nine of ten steps are {low:.2g} to {high:.2g} of the median.")
     if choice.errors:
         terms = [f"{', '.join(names) or 'none'} by {OF_CLOCK[name]}" for name, names in choice.terms.items()]

@@ -10,22 +10,16 @@ import numpy as np
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Key, Theta
 from go1exp.gap.result import Candidate
+from go1exp.gap.search import thresholds
 from go1exp.gap.search.fit import Model
 from go1exp.sim.effects.tolerances import Tolerances, effect_class, sizes
-
-RELIEF = 4.0
-"""Fall of chi2, were its tolerance wider, from which an effect is listed although the tolerances explain the data."""
-
-
-ROUNDING = 1e-9
-"""Share of a tolerance by which a value that was clipped to it may lie beyond it: 1.05 - 1 is more than 0.05."""
 
 
 def deviation(theta: Theta, key: Key, tolerances: Tolerances) -> np.ndarray:
     """Return how far a parameter is from null, in tolerances; 1 for a value that lies on its tolerance."""
     p = tolerances.param(key)
     away = np.asarray(np.abs(theta.get(key, np.array([p.null])) - p.null) / p.tolerance)
-    return np.where(np.abs(away - 1.0) < ROUNDING, 1.0, away)
+    return np.where(np.abs(away - 1.0) < thresholds.ROUNDING, 1.0, away)
 
 
 def size(effect: str, theta: Theta, tolerances: Tolerances) -> float:
@@ -42,15 +36,11 @@ def beyond(effect: str, theta: Theta, joints: Sequence[str], tolerances: Toleran
     return outside
 
 
-AT_BOUND = 0.02
-"""Distance from a bound, in tolerances, that counts as being there: the data would have the value go further."""
-
-
 def at_bound(key: Key, theta: Theta, tolerances: Tolerances) -> np.ndarray:
     """Return which values of a parameter (J,) or (1,) leave their tolerance and lie on a bound of the parameter."""
     p = tolerances.param(key)
     values = np.ravel(theta.get(key, np.array([p.null])))
-    near = [np.abs(values - bound) <= AT_BOUND * p.tolerance for bound in (p.low, p.high)]
+    near = [np.abs(values - bound) <= thresholds.AT_BOUND * p.tolerance for bound in (p.low, p.high)]
     return np.asarray((near[0] | near[1]) & (np.abs(values - p.null) > p.tolerance))
 
 
@@ -106,7 +96,7 @@ def absorbed(
         tolerances: these.
         most: rows.
     """
-    order = sorted((e for e in relief if relief[e] > RELIEF), key=lambda e: -relief[e])
+    order = sorted((e for e in relief if relief[e] > thresholds.LISTED_RELIEF), key=lambda e: -relief[e])
     return [
         Candidate(
             effect=effect,

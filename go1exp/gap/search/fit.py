@@ -12,17 +12,8 @@ from go1exp.gap.replay.rows import Key, Probe, Rows, Theta, null, variants
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import Layout, Table, corrected, differences
 from go1exp.gap.score.robust import log_chi2
-from go1exp.gap.search import tolerances
+from go1exp.gap.search import thresholds, tolerances
 from go1exp.sim.effects.tolerances import Tolerances
-
-STEPS = (1.0, 0.3)
-"""Lengths of a Gauss-Newton step that are tried."""
-
-LITTLE = 0.003
-"""Fall of the mean log chi2 in a step after which columns that only learn from steps have no more to give."""
-
-HOPELESS = 0.4
-"""Share of the best gain below which a candidate is not fitted further."""
 
 
 @dataclass(frozen=True)
@@ -91,15 +82,17 @@ def fit(scorer: Scorer, models: Sequence[Model], common: Table, iterations: int,
             break
         moves = _moves(scorer, [best[k] for k in alive], common, dt)
         tries = [
-            _moved(scorer, best[k], move, length) for k, move in zip(alive, moves, strict=True) for length in STEPS
+            _moved(scorer, best[k], move, length)
+            for k, move in zip(alive, moves, strict=True)
+            for length in thresholds.STEP_LENGTHS
         ]
         tried = residuals(scorer, tries, windows, dt)
         for n, k in enumerate(alive):
-            lengths = slice(n * len(STEPS), (n + 1) * len(STEPS))
+            lengths = slice(n * len(thresholds.STEP_LENGTHS), (n + 1) * len(thresholds.STEP_LENGTHS))
             best[k] = _longest(scorer, best[k], moves[n], tries[lengths], tried[lengths], windows)
         if turn == 0 and len(models) > 1:
             gain = {k: origin - misfit(best[k]) for k in alive}
-            alive = [k for k in alive if gain[k] > 0.0 and gain[k] >= HOPELESS * max(gain.values())]
+            alive = [k for k in alive if gain[k] > 0.0 and gain[k] >= thresholds.HOPELESS * max(gain.values())]
     return best
 
 
@@ -118,7 +111,7 @@ def descend(scorer: Scorer, model: Model, linear: Table, steps: int, dt: float) 
     for turn in range(steps):
         (model,) = fit(scorer, [replace(model, theta=linear.theta)], linear, 1, dt)
         last, reached = reached, float(log_chi2(_chi2(model)).mean())
-        if turn == steps - 1 or (turn and last - reached < LITTLE):
+        if turn == steps - 1 or (turn and last - reached < thresholds.BROYDEN_GAIN):
             break
         before, unit = tolerances.unknowns(layout, linear.probes, linear.theta, known)
         after, _ = tolerances.unknowns(layout, linear.probes, model.theta, known)
@@ -184,7 +177,7 @@ def _longest(
     """Return the model moved so far that each group of joints does best; what all share goes where most like it."""
     machine, layout = scorer.replayer.machine, move[1]
     chi2 = np.stack([_chi2(model), *(scorer.chi2(r, windows) for r in tried)])  # L V G
-    lengths = np.array([0.0, *STEPS])
+    lengths = np.array([0.0, *thresholds.STEP_LENGTHS])
     value = (scorer.size[windows][:, None] * log_chi2(chi2)).sum(axis=1)  # L G
     value += np.stack([_prior(machine, move, length) for length in lengths])
     which = value.argmin(axis=0)

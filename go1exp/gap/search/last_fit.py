@@ -16,20 +16,10 @@ import numpy as np
 
 from go1exp.gap.replay.rows import Key, Probe, Theta
 from go1exp.gap.score.linear import Layout, Table, table, unbiased_grams
-from go1exp.gap.search import significance, tolerances
+from go1exp.gap.search import significance, thresholds, tolerances
 from go1exp.gap.search.fit import descend
 from go1exp.gap.search.ledger import Ledger
 from go1exp.gap.search.state import State
-
-FEWEST_BOOTSTRAPS = 20
-"""Resamples from which an interval can be read, also where the user asks for fewer."""
-
-STEPS = 4
-"""Gauss-Newton steps of the fit where its residuals are those of a finer step, which the search has not seen."""
-
-LAW = 0.04
-"""Relative standard deviation of a value because no robot follows a law of the library exactly: the intervals of sealed
-effects (265 values), widened to it, held 89 % of the truths, and with 2 % 76 %, before those of this module."""
 
 
 def resampled_values(search: Ledger) -> tuple[Theta, dict[Key, np.ndarray]]:
@@ -44,18 +34,18 @@ def resampled_values(search: Ledger) -> tuple[Theta, dict[Key, np.ndarray]]:
     state = search.state.finer()
     fitted = np.sort(np.concatenate([search.splits.train, search.splits.select]))
     linear = state.linear(state.theta, fitted)
-    steps = STEPS if state.scorer.finer > 1 else 1
+    steps = thresholds.LAST_STEPS if state.scorer.finer > 1 else 1
     best = descend(state.scorer, state.model(state.theta), linear, steps, search.dt)
     assert best.chi2 is not None
     assert best.residual is not None
     about = replace(linear, residual=best.residual, theta=best.theta)
-    count = max(search.settings.bootstraps, FEWEST_BOOTSTRAPS)
+    count = max(search.settings.bootstraps, thresholds.FEWEST_BOOTSTRAPS)
     drawn: dict[Key, list[np.ndarray]] = {}
     of_terms = [key for key in state.keys if key[0] in state.terms]
     for values in bootstrapped(state, about, best.chi2, search.rng, count, nominal=True):
         for key in of_terms:
             null = state.tolerances.param(key).null
-            law = 1.0 + LAW * search.rng.standard_normal(values[key].shape)
+            law = 1.0 + thresholds.LAW_SD * search.rng.standard_normal(values[key].shape)
             drawn.setdefault(key, []).append(null + (values[key] - null) * law)
     return best.theta, {key: np.stack([np.ravel(v) for v in values]) for key, values in drawn.items()}
 

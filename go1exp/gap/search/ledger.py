@@ -13,7 +13,7 @@ from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import Candidate, GapSettings
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.robust import excess, removed
-from go1exp.gap.search import significance
+from go1exp.gap.search import significance, thresholds
 from go1exp.gap.search.fit import Model
 from go1exp.gap.search.state import State
 
@@ -92,7 +92,7 @@ class Ledger:
             return LastCheck(True, math.nan)
         before, after = (self.state.held_out(theta, kept) for theta in (self.nominal, self.state.theta))
         level = excess(before)
-        least = 0.0 if level > self.settings.material else -significance.SAME
+        least = 0.0 if level > self.settings.material else -thresholds.SAME_GAIN
         helps = bool(significance.gains(before, after[None]).mean() > least)
         return LastCheck(helps, removed(level, excess(after)) if level > self.settings.adequate else math.nan)
 

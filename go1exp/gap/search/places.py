@@ -10,20 +10,8 @@ import numpy as np
 
 from go1exp.gap.score.linear import Layout, predicted
 from go1exp.gap.score.robust import log_chi2
-from go1exp.gap.search import evidence, significance, strain, tolerances
+from go1exp.gap.search import evidence, significance, strain, thresholds, tolerances
 from go1exp.gap.search.state import State
-
-NEEDED = 12.0
-"""Fall of chi2 that a joint must bring before it may leave the tolerance of a term's effect."""
-
-PLAIN = 0.05
-"""A joint that brings this share of what the joint with the most brings needs no further proof."""
-
-LOST = 0.6
-"""Share of what a term brings that fewer joints may lose in the linear model and still be tried."""
-
-DOUBTFUL = 0.05
-"""p-value on held-out windows from which a joint that brings less is left out."""
 
 
 def parts(joints: Sequence[str]) -> list[frozenset[int]]:
@@ -114,15 +102,18 @@ def chosen(linear: Linear, name: str, kept: frozenset[tuple[str, int]], rng: np.
     inside = frozenset[int]()
     while inside != outside:
         larger = min(
-            (inside | piece for piece in sets), key=lambda joints_of: price(joints_of) + NEEDED * len(joints_of)
+            (inside | piece for piece in sets),
+            key=lambda joints_of: price(joints_of) + thresholds.JOINT_GAIN * len(joints_of),
         )
-        if price(larger) + NEEDED * len(larger) >= price(inside) + NEEDED * len(inside):
+        if price(larger) + thresholds.JOINT_GAIN * len(larger) >= price(inside) + thresholds.JOINT_GAIN * len(inside):
             break
         inside = larger
     brings = {j: price(inside - {j}) - price(inside) for j in inside}
     for j in sorted(brings, key=lambda j: brings[j]):
         relief = price(inside - {j}) - price(inside)
-        if len(inside) > 1 and (relief < NEEDED or _unmissed(linear, j, relief, brings, without, inside, rng)):
+        if len(inside) > 1 and (
+            relief < thresholds.JOINT_GAIN or _unmissed(linear, j, relief, brings, without, inside, rng)
+        ):
             inside -= {j}
     return inside or frozenset([max(outside, key=lambda j: price(outside - {j}))])
 
@@ -150,7 +141,7 @@ def fewer(linear: Linear, name: str, kept: frozenset[tuple[str, int]]) -> list[f
     smaller = {piece & outside for piece in pieces(joints)} - {outside, frozenset()}
     left = {piece: (price(piece) - least) / max(most - least, 1e-9) for piece in smaller}
     best: dict[int, frozenset[int]] = {}
-    for piece in sorted((p for p in left if left[p] < LOST), key=lambda p: left[p]):
+    for piece in sorted((p for p in left if left[p] < thresholds.LOST_SHARE), key=lambda p: left[p]):
         best.setdefault(len(piece), piece)
     return [best[size] for size in sorted(best)]
 
@@ -165,8 +156,10 @@ def _unmissed(
     rng: np.random.Generator,
 ) -> bool:
     """Return whether held-out windows do as well without a joint that brings little beside the others."""
-    if relief >= PLAIN * max(brings.values()):
+    if relief >= thresholds.PLAIN_SHARE * max(brings.values()):
         return False
     group = next(g for g, members in enumerate(linear.machine.groups) if joint in members)
     gain = linear.held_out(without(inside - {joint})) - linear.held_out(without(inside))
-    return bool(gain[:, group].mean() <= 0.0 or significance.max_t(gain[None, :, group], rng)[0] > DOUBTFUL)
+    return bool(
+        gain[:, group].mean() <= 0.0 or significance.max_t(gain[None, :, group], rng)[0] > thresholds.DOUBTFUL_P
+    )

@@ -19,20 +19,9 @@ from go1exp.gap.replay.rows import Key, Theta, variants
 from go1exp.gap.score.initial_state import FARTHEST, solved
 from go1exp.gap.score.likelihood import Scorer, gram, scorer
 from go1exp.gap.score.robust import log_chi2
+from go1exp.gap.search import thresholds
 from go1exp.sim.effects.base import Param
 from go1exp.sim.effects.tolerances import declared
-
-ROUNDS = 2
-"""Steps of the initial states, all by the changes that were measured at the nominal model."""
-
-SHARES = (1.0, 0.4)
-"""Shares of a step that are tried, window by window."""
-
-FIRST = 2.0
-"""Lowest rung of the ladder, in tolerances; each further one is twice as far."""
-
-CLOSER = 8
-"""Tries between the neighbours of the best rung."""
 
 
 def begun(score: Scorer, dt: float) -> Scorer:
@@ -74,10 +63,10 @@ def chi2(score: Scorer, theta: Theta, windows: np.ndarray, dt: float) -> np.ndar
 
     off = np.zeros((len(windows), coordinates))
     residual, best = at(off)
-    for _ in range(ROUNDS):
+    for _ in range(thresholds.STATE_ROUNDS):
         step = solved(state[:, 0], residual[:, 0], off)[0][:, :coordinates].clip(-FARTHEST, FARTHEST)
         begin = off.copy()
-        for share in SHARES:
+        for share in thresholds.STATE_STEPS:
             other, value = at(begin + share * step)
             better = value[:, 0] < best[:, 0]
             off[better], residual[better], best[better] = (begin + share * step)[better], other[better], value[better]
@@ -114,7 +103,7 @@ def fitted(
         if rungs[k] == p.null:
             continue
         between = rungs[max(k - 1, 0)], rungs[min(k + 1, len(rungs) - 1)]
-        nearest = minimize_scalar(at, bounds=between, options={"maxiter": CLOSER})
+        nearest = minimize_scalar(at, bounds=between, options={"maxiter": thresholds.RUNG_TRIES})
         value, least = (nearest.x, float(nearest.fun)) if nearest.fun < costs[k] else (rungs[k], costs[k])
         theta = {**theta, key: _everywhere(score, key, value)}
     return theta, least
@@ -146,7 +135,7 @@ def within_tolerances(score: Scorer, begin: Theta, keys: Sequence[Key], windows:
     least = cost(score, theta, windows, dt)
     for key in [*(k for k in keys if k not in theta), *theta]:
         nearest = minimize_scalar(
-            _along(score, key, theta, windows, dt), bounds=limits[key], options={"maxiter": CLOSER}
+            _along(score, key, theta, windows, dt), bounds=limits[key], options={"maxiter": thresholds.RUNG_TRIES}
         )
         if nearest.fun < least:
             theta, least = {**theta, key: _everywhere(score, key, nearest.x)}, float(nearest.fun)
@@ -182,7 +171,7 @@ def at_one_part(
         nearest = minimize_scalar(
             lambda value, along=along: cost(score, along(value), windows, dt),
             bounds=_limits(score, key),
-            options={"maxiter": CLOSER},
+            options={"maxiter": thresholds.RUNG_TRIES},
         )
         if nearest.fun < least:
             theta, least = along(nearest.x), float(nearest.fun)
@@ -205,7 +194,7 @@ def _with_part(score: Scorer, theta: Theta, key: Key, part: frozenset[int], valu
 
 def ladder(p: Param) -> list[float]:
     """Return the values of a parameter that are tried first, in order, the null value among them."""
-    rungs, far = {p.null}, FIRST * p.tolerance
+    rungs, far = {p.null}, thresholds.FIRST_RUNG * p.tolerance
     while p.null - far >= p.low or p.null + far <= p.high:
         rungs |= {v for v in (p.null - far, p.null + far) if p.low <= v <= p.high}
         far *= 2.0

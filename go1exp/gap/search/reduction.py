@@ -10,14 +10,11 @@ from scipy.stats import norm
 
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.score.robust import excess, removed
-from go1exp.gap.search import evidence, places, significance, tolerances
+from go1exp.gap.search import evidence, places, significance, thresholds, tolerances
 from go1exp.gap.search.last_fit import bootstrapped
 from go1exp.gap.search.ledger import Ledger
 from go1exp.gap.search.state import State
 from go1exp.sim.effects.tolerances import sizes
-
-DRAWS = 40
-"""Bootstraps from which it is read whether two parameters are equal."""
 
 
 def eliminate(search: Ledger) -> None:
@@ -79,7 +76,7 @@ def concentrate(search: Ledger, name: str) -> None:
         chi2 = sparse.held_out()
         loss = -significance.gains(search.select_chi2, chi2[None])
         worse = significance.max_t(loss, search.rng, len(search.state.machine.groups))[0]
-        if loss.mean() < significance.SAME and worse > places.DOUBTFUL:
+        if loss.mean() < thresholds.SAME_GAIN and worse > thresholds.DOUBTFUL_P:
             search.state, search.select_chi2 = sparse, chi2
             search.steps.append(("at fewer joints", excess(chi2)))
             return
@@ -94,7 +91,7 @@ def keep_within(search: Ledger, kept: frozenset[tuple[str, int]]) -> bool:
     """
     sparse = search.state.keeping(kept).settled(2)
     chi2 = sparse.held_out()
-    if significance.gains(search.select_chi2, chi2[None]).mean() < -significance.SAME:
+    if significance.gains(search.select_chi2, chi2[None]).mean() < -thresholds.SAME_GAIN:
         return False  # what looked small in the linear model was not
     search.state, search.select_chi2 = sparse, chi2
     search.steps.append(("at fewer joints", excess(chi2)))
@@ -152,7 +149,9 @@ def instead_of(state: State, name: str) -> State:
 def resampled(search: Ledger) -> list[Theta]:
     """Return values of the model by bootstraps of the windows of the fit, to first order."""
     state = search.state
-    return list(bootstrapped(state, state.table, state.train_chi2, search.rng, DRAWS, nominal=False))
+    return list(
+        bootstrapped(state, state.table, state.train_chi2, search.rng, thresholds.EQUALITY_DRAWS, nominal=False)
+    )
 
 
 def replaced(search: Ledger, name: str, instead: str, rest: State, equals: tuple[str, ...] = ()) -> None:
@@ -178,7 +177,7 @@ def unite(search: Ledger) -> None:
         before = search.state.held_out(search.nominal)
         gain, less = significance.gains(before, np.stack([search.select_chi2, chi2])).mean(axis=1)
         as_well = less > gain - significance.same(gain)
-        as_well &= excess(chi2) <= excess(search.select_chi2) + significance.SAME
+        as_well &= excess(chi2) <= excess(search.select_chi2) + thresholds.SAME_GAIN
         if as_well and evidence.size(model.name, rest.theta, rest.tolerances) > 1.0:
             search.reject(several, f"{model.name} alone does as well")
             replaced(search, several[0], model.name, rest)

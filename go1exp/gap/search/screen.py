@@ -15,18 +15,9 @@ from go1exp.gap.replay.rows import Key, Probe, Theta, variants
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import Layout, Table, differences, predicted
 from go1exp.gap.score.robust import log_chi2
-from go1exp.gap.search import strain, tolerances
+from go1exp.gap.search import strain, thresholds, tolerances
 from go1exp.sim.effects.identification import Identification, Periodic
 from go1exp.sim.effects.tolerances import Tolerances, sizes
-
-PROBE = 2.0
-"""Change of a parameter by which it is probed, in tolerances."""
-
-
-OUTSIDE = 0.03
-"""Fall of chi2 per value, in the windows of the screening, of which half are the worst, for an effect that the
-tolerances have no place for: at most 0.0074 in development nulls, 0.053 and 0.138 for effects of two tolerances that
-others hid."""
 
 
 @dataclass(frozen=True)
@@ -132,15 +123,11 @@ def library(machine: Machine, moved: Motion, exclude: Collection[str] = ()) -> l
 def _periods(machine: Machine, effect: str, periodic: Periodic) -> Iterator[Variant]:
     """Yield a variant for each number of periods per turn, with amplitudes at phases 0 and pi / 2."""
     key = (effect, periodic.amplitude)
-    plain = tolerances.probes(machine, [key], {}, PROBE)
+    plain = tolerances.probes(machine, [key], {}, thresholds.PROBE)
     for count in periodic.counts:
         at: Theta = {(effect, periodic.count): np.array([count])}
         phases = [{**at, (effect, periodic.phase): np.array([phase])} for phase in (0.0, math.pi / 2)]
         yield Variant(effect, tuple(Probe(key, p.place, p.delta, also) for also in phases for p in plain), at)
-
-
-SHARES = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4)
-"""Shares of the largest torque that a part was asked for at which a limit of the torque is looked for."""
 
 
 def _levels(machine: Machine, effect: str, how: Identification, moved: Motion) -> Iterator[Variant]:
@@ -150,7 +137,7 @@ def _levels(machine: Machine, effect: str, how: Identification, moved: Motion) -
         limit = machine.tolerances.param((effect, how.limits_torque))
         for part in np.array(machine.groups).T:  # the same place of each group
             largest = min(float(moved.demand[part].max()), limit.null)  # what is asked for beyond the peak is cut off
-            for share in SHARES:
+            for share in thresholds.TORQUE_SHARES:
                 change = np.zeros(len(machine.joints))
                 change[part] = np.clip(share * largest, limit.low, limit.null - limit.tolerance) - limit.null
                 levels.append({how.limits_torque: change})
@@ -159,7 +146,7 @@ def _levels(machine: Machine, effect: str, how: Identification, moved: Motion) -
         for level in levels or [{}]:
             keys = [key for key in sizes(effect) if not level or key[1] in level]
             probes = []
-            for p in tolerances.probes(machine, keys, {}, PROBE):
+            for p in tolerances.probes(machine, keys, {}, thresholds.PROBE):
                 key = (effect, p.key[1])
                 delta = _within(machine, key, level[key[1]], p.delta) if level else p.delta
                 probes.append(Probe(p.key, p.place, delta, shapes))
@@ -179,7 +166,7 @@ def _within(machine: Machine, key: Key, change: float | np.ndarray, like: np.nda
         return delta
     beyond = (p.null + delta < p.low) | (p.null + delta > p.high)
     delta[beyond] = (p.null + delta[beyond]).clip(p.low, p.high) - p.null
-    delta[beyond & (np.abs(delta) < tolerances.SMALL * p.tolerance)] = 0.0
+    delta[beyond & (np.abs(delta) < thresholds.DIFFERENCE * p.tolerance)] = 0.0
     return delta
 
 
@@ -280,9 +267,9 @@ def outside(screened: Sequence[Screened], within: Collection[str]) -> list[Scree
         within: effects that move within their tolerances already.
     """
     order = sorted(screened, key=lambda s: -s.relief)
-    if not order or order[0].variant.effect in within or order[0].relief < OUTSIDE:
+    if not order or order[0].variant.effect in within or order[0].relief < thresholds.OUTSIDE_BOX:
         return []
-    return [s for s in order if s.relief > order[0].relief / strain.LEAD]
+    return [s for s in order if s.relief > order[0].relief / thresholds.RIVAL_RATIO]
 
 
 def rivals(screened: Sequence[Screened], straining: Collection[str], within: Collection[str]) -> list[Screened]:
@@ -302,7 +289,7 @@ def rivals(screened: Sequence[Screened], straining: Collection[str], within: Col
         name = s.variant.effect
         if name not in within and any(tolerances.confounded(name, one) for one in straining):
             best.setdefault(name, s)
-    return [s for s in best.values() if s.relief > most / strain.LEAD]
+    return [s for s in best.values() if s.relief > most / thresholds.RIVAL_RATIO]
 
 
 def _start(

@@ -6,27 +6,7 @@ import numpy as np
 
 from go1exp.gap.result import GapSettings
 from go1exp.gap.score.robust import log_chi2
-
-FLIPS = 4000
-"""Sign flips of a test: the smallest p-value is 1 / (FLIPS + 1)."""
-
-SAME = 0.02
-"""Gains of log chi2 that differ by less mean the same: 2 % of the floor, or of the larger of the gains."""
-
-WORSE = 0.05
-"""A model with a p-value below this is worse than another."""
-
-LEAST = 0.7
-"""A model with less than this share of the best one's gain is no equal, however uncertain."""
-
-FEW_WINDOWS = 10.0
-"""Times ``alpha`` of the settings that are enough for what removes ``LARGE`` of a gap: a stop or a limit of the torque
-shows in few windows, and flipped signs cannot call three of them significant. Of sealed effects that removed so much
-with p of 0.01 to 0.1, and did not come second to another one, all three were right; what removed half to ``LARGE``, one
-of three."""
-
-LARGE = 0.75
-"""Share of the excess that only the right effect removes, or one that acts alike."""
+from go1exp.gap.search import thresholds
 
 
 def gains(before: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -41,7 +21,9 @@ def gains(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     return np.asarray(log_chi2(before) - log_chi2(after)).reshape(len(after), -1)
 
 
-def max_t(gain: np.ndarray, rng: np.random.Generator, groups: int = 1, flips: int = FLIPS) -> np.ndarray:
+def max_t(
+    gain: np.ndarray, rng: np.random.Generator, groups: int = 1, flips: int = thresholds.SIGN_FLIPS
+) -> np.ndarray:
     """Return a p-value (M,) for each of M models' mean gain (M, V G), right for all of them together.
 
     Under the hypothesis that a model gains nothing, a window's gain is as likely negative. All models' signs are
@@ -75,21 +57,21 @@ def shown(p: np.ndarray, share: np.ndarray, before: float, settings: GapSettings
         before: excess of the model with which they are compared.
         settings: significance, and the excess that is a gap.
     """
-    large = (share >= LARGE) & (before > settings.material)
-    return np.asarray((p < settings.alpha) | (large & (p < FEW_WINDOWS * settings.alpha)))
+    large = (share >= thresholds.LARGE_SHARE) & (before > settings.material)
+    return np.asarray((p < settings.alpha) | (large & (p < thresholds.LARGE_ALPHA * settings.alpha)))
 
 
 def same(gain: float) -> float:
     """Return by how much the mean of another model's gain may be smaller and still mean the same."""
-    return SAME * max(1.0, gain)
+    return thresholds.SAME_GAIN * max(1.0, gain)
 
 
 def equals(gain: np.ndarray, best: int, rng: np.random.Generator) -> np.ndarray:
     """Return which models (M,) do as well as ``best`` by their gains (M, V): all but so, or not significantly worse."""
     mean = gain.mean(axis=1)
     equal = mean >= mean[best] - same(mean[best])
-    for k in np.flatnonzero(~equal & (mean > LEAST * mean[best])):
-        equal[k] = max_t((gain[best] - gain[k])[None], rng)[0] > WORSE
+    for k in np.flatnonzero(~equal & (mean > thresholds.EQUAL_SHARE * mean[best])):
+        equal[k] = max_t((gain[best] - gain[k])[None], rng)[0] > thresholds.WORSE_P
     equal[best] = True
     return np.asarray(equal)
 

@@ -22,22 +22,10 @@ from go1exp.gap.replay.rows import Theta
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import table
 from go1exp.gap.score.robust import excess, log_chi2, removed
-from go1exp.gap.search import alike, places, profile_likelihood, significance, tolerances
+from go1exp.gap.search import alike, places, profile_likelihood, significance, thresholds, tolerances
 from go1exp.gap.search.fit import Model, fit, scores
 from go1exp.gap.search.state import State
 from go1exp.sim.effects.tolerances import effect_class, sizes
-
-ITERATIONS = 4
-"""Gauss-Newton steps of a fit: joints that stick make a payload's first ones short."""
-
-STRETCHES = (1.0, 0.85, 1.15, 1.4)
-"""Factors on fitted values that are tried after a fit: where joints stick, small changes tell less than large ones."""
-
-TURNS = 2
-"""Times that initial states are moved to suit the best effect, and it is fitted again."""
-
-NEARLY_ALL = 0.8
-"""Share of the held-out excess that an effect must remove alone."""
 
 
 def stretched(scorer: Scorer, model: Model, windows: np.ndarray, dt: float) -> Model:
@@ -46,7 +34,7 @@ def stretched(scorer: Scorer, model: Model, windows: np.ndarray, dt: float) -> M
         return model
     for _ in range(2):
         tries = []
-        for factor in STRETCHES:
+        for factor in thresholds.STRETCHES:
             theta = {}
             for key, value in model.theta.items():
                 p = model.may.tolerances.param(key)
@@ -63,7 +51,7 @@ def stretched(scorer: Scorer, model: Model, windows: np.ndarray, dt: float) -> M
 def refitted(scorer: Scorer, model: Model, windows: np.ndarray, dt: float) -> Model:
     """Return a model fitted from where it is, by initial states that suit it."""
     empty = table(scorer, {}, windows, [], dt)
-    (fitted,) = fit(scorer, [model], empty, ITERATIONS, dt)
+    (fitted,) = fit(scorer, [model], empty, thresholds.CAUSE_STEPS, dt)
     return stretched(scorer, fitted, windows, dt)
 
 
@@ -107,7 +95,7 @@ def clearest(begun: Scorer, state: State) -> Sought:
 
     def loses(rival: Theta) -> bool:
         other = profile_likelihood.chi2(begun, rival, select, dt)
-        return bool(significance.gains(chi2, other[None]).mean() < -significance.SAME)
+        return bool(significance.gains(chi2, other[None]).mean() < -thresholds.SAME_GAIN)
 
     clear = loses({}) and all(loses(rival) for rival, _ in fits.values() if rival)
     of_trunk_alone = clear and name in of_trunk
@@ -178,11 +166,11 @@ def _confirmed(best: Model, state: State, judged: Judge, plain: np.ndarray, now:
     """
     if state.settings.effects and best.name not in state.settings.effects:
         return None
-    for _ in range(TURNS):
+    for _ in range(thresholds.CAUSE_TURNS):
         state = replace(state, theta=best.theta).renewed()
         best = refitted(state.scorer, best, state.splits.train, state.dt)
     if not alike.may_be(best, state):
         return None
     share = removed(excess(now), excess(state.held_out(best.theta)))
     accepted, _ = judged([best], state, plain, now)
-    return best if accepted is not None and share >= NEARLY_ALL else None
+    return best if accepted is not None and share >= thresholds.NEARLY_ALL else None

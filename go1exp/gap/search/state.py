@@ -14,27 +14,11 @@ from go1exp.gap.result import GapSettings
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import Table, borrowed, table
 from go1exp.gap.score.robust import log_chi2
-from go1exp.gap.search import tolerances
-from go1exp.gap.search.fit import LITTLE, Model, descend, scores
+from go1exp.gap.search import thresholds, tolerances
+from go1exp.gap.search.fit import Model, descend, scores
 from go1exp.gap.search.screen import free_shapes
 from go1exp.gap.search.tolerances import Freedom
 from go1exp.sim.effects.tolerances import Tolerances, sizes
-
-SETTLED = 0.03
-"""Fall of log chi2 in a round of fitting below which the next one is not worth its time: it gains an eighth or so."""
-
-SETTLED_SHARE = 0.01
-"""The same as a share of log chi2: where much is missing, less does not decide anything."""
-
-GOOD = 0.01
-"""Log chi2 below which a model without terms needs no more rounds."""
-
-STEPS_PER_ROUND = 2
-"""Gauss-Newton steps before the linear model is measured again, at most."""
-
-FINER = 4
-"""Part of the physics step at which residuals of the last fit are replayed. What steps of 1 ms err by can look like
-0.4 ms less of a delay, many times the width of its interval. Columns, which cost far more, hardly change with it."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +109,7 @@ class State:
             linear = nearby if borrowing else state.linear(state.theta, self.splits.train)
             assert linear is not None
             before = float(log_chi2(self.scorer.chi2(linear.residual, linear.windows)).mean())
-            best = descend(self.scorer, self.model(state.theta), linear, STEPS_PER_ROUND, self.dt)
+            best = descend(self.scorer, self.model(state.theta), linear, thresholds.STEPS_PER_ROUND, self.dt)
             assert best.residual is not None
             # Columns as they were measured: what they learned holds for the steps that were made, and for no others.
             fitted = replace(linear, residual=best.residual, theta=best.theta)
@@ -137,9 +121,11 @@ class State:
             if reached - gain > worst:
                 break
             if borrowing:
-                if self._beside and gain < LITTLE:
+                if self._beside and gain < thresholds.BROYDEN_GAIN:
                     break
-            elif gain < max(SETTLED, SETTLED_SHARE * reached) or (reached < GOOD and not self.terms):
+            elif gain < max(thresholds.CONVERGED, thresholds.CONVERGED_SHARE * reached) or (
+                reached < thresholds.GOOD_FIT and not self.terms
+            ):
                 break
         return state
 
@@ -184,7 +170,7 @@ class State:
 
         Feet that touch the ground at another moment change more than the values do.
         """
-        finer = 1 if self.machine.on_ground else FINER
+        finer = 1 if self.machine.on_ground else thresholds.FINER_STEPS
         return replace(self, scorer=replace(self.scorer, finer=finer))
 
     def without(self, term: str, instead: str = "") -> State:

@@ -9,29 +9,13 @@ import numpy as np
 
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.score.robust import excess
-from go1exp.gap.search import evidence, reduction, significance, single_cause, strain, tolerances
+from go1exp.gap.search import evidence, reduction, significance, single_cause, strain, thresholds, tolerances
 from go1exp.gap.search.fit import Model, fit, misfit
 from go1exp.gap.search.ledger import Ledger
 from go1exp.gap.search.screen import Screened, library, motion, outside, rivals, screen
 from go1exp.gap.search.state import State
 from go1exp.gap.search.trial import Trial, tried
 from go1exp.sim.effects.tolerances import sizes
-
-SILENT = 0.02
-"""An effect that adds less than this to the chi2 of every window, at twice its tolerance, is not excited."""
-
-SCREENED = 20
-"""Windows in which candidates are screened, at most."""
-
-RIVAL_ROUNDS = 4
-"""Rounds of fitting, at most, of an effect that one which strains may be taken for: it begins at a small part of its
-size, which is all that the linear model has left to it, and its place must be found as well."""
-
-RIVALS = 2
-"""Candidates beside the first term that are tried in the place of several terms."""
-
-LOOSENED = 3
-"""Most effects that join the tolerance box because the data ask for some of them, within their tolerances."""
 
 
 @dataclass
@@ -61,7 +45,7 @@ class Search(Ledger):
             reduction.prune(self)
             reduction.symmetrical(self)
         sizes_of_terms = [evidence.size(t, self.state.theta, self.state.tolerances) for t in self.state.terms]
-        if self.strained and sizes_of_terms and max(sizes_of_terms) <= strain.CLEAR:
+        if self.strained and sizes_of_terms and max(sizes_of_terms) <= thresholds.CLEARLY_BEYOND:
             self.withdraw("it leaves its tolerance by too little to be called missing")
 
     def single_cause(self) -> Model | None:
@@ -102,7 +86,7 @@ class Search(Ledger):
             self.progress(f"fitting the model with {accepted.name}", share + 0.12)
             self.strained |= small and not self.state.terms
             return self._accept(accepted)
-        if inside is None or len(self.state.loosened) == LOOSENED:
+        if inside is None or len(self.state.loosened) == thresholds.MOST_RELAXED:
             return False
         self.progress(f"fitting the model with {inside.name}", share + 0.12)
         self._loosen(inside)
@@ -133,14 +117,14 @@ class Search(Ledger):
             return self._fitted(missing)
         given_back = [self._given_back(effect, self.state.theta) for effect in straining]
         taken_for = rivals(screened or self._screened(), straining, within)
-        fitted = [self._given_back(s.variant.effect, s.theta, RIVAL_ROUNDS) for s in taken_for]
+        fitted = [self._given_back(s.variant.effect, s.theta, thresholds.RIVAL_ROUNDS) for s in taken_for]
         return given_back + [replace(m, keys=s.variant.free) for m, s in zip(fitted, taken_for, strict=True)]
 
     def _accept(self, model: Model) -> bool:
         """Make a candidate a term, unless the model is worse with all else fitted again; return whether it is one."""
         first = self.first
         state, chi2 = self._with_term(model)
-        if excess(chi2) <= excess(state.held_out(self.state.theta)) + significance.SAME:  # by the same floors
+        if excess(chi2) <= excess(state.held_out(self.state.theta)) + thresholds.SAME_GAIN:  # by the same floors
             self.state, self.select_chi2 = state, chi2
             return True
         self.steps.pop()
@@ -165,7 +149,7 @@ class Search(Ledger):
             state = state.renewed().settled(2 if held else 1)
         chi2, plain = state.held_out(), state.held_out(model.theta)
         # With little data, what was fitted from scratch can be a poorer optimum.
-        if excess(plain) < excess(chi2) - significance.SAME:
+        if excess(plain) < excess(chi2) - thresholds.SAME_GAIN:
             state, chi2 = state.at(model.theta), plain
         self.measured_again(excess(state.held_out(self.nominal)))  # by the same floors
         self.steps.append((model.name, excess(chi2)))
@@ -191,8 +175,10 @@ class Search(Ledger):
             variants = [v for v in variants if v.effect in self.settings.effects]
         count = len(linear.windows)
         # Half of the windows that are looked at are the worst, half are spread evenly.
-        worst = np.argsort(-self.state.scorer.chi2(linear.residual, linear.windows).sum(1))[: SCREENED // 2]
-        evenly = np.linspace(0, count - 1, min(SCREENED // 2, count)).astype(int)
+        worst = np.argsort(-self.state.scorer.chi2(linear.residual, linear.windows).sum(1))[
+            : thresholds.SCREENED_WINDOWS // 2
+        ]
+        evenly = np.linspace(0, count - 1, min(thresholds.SCREENED_WINDOWS // 2, count)).astype(int)
         part = linear.part(np.unique([*worst, *evenly]))
         return screen(self.state.scorer, self.state.theta, part, self.state.may, variants, self.dt)
 
@@ -300,9 +286,9 @@ class Search(Ledger):
             return None, inside
         accepted = fitted[trial.chosen]
         if not self.state.terms:
-            near = trial.mean > significance.LEAST * trial.mean[trial.chosen]
+            near = trial.mean > thresholds.EQUAL_SHARE * trial.mean[trial.chosen]
             order = [k for k in np.argsort(-trial.mean) if near[k] and trial.sizes[k] > 1.0 and k != trial.chosen]
-            self.rivals = [fitted[k] for k in order[:RIVALS]]
+            self.rivals = [fitted[k] for k in order[: thresholds.RIVALS]]
         self.aliases[accepted.name] = (accepted.name, *(n for n in names if n != accepted.name))
         on_train = significance.gains(train, np.stack([m.chi2 for m in fitted if m.chi2 is not None]))
         every = np.concatenate([on_train, trial.gain], axis=1)

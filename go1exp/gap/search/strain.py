@@ -8,22 +8,7 @@ import numpy as np
 
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import Layout, Table
-from go1exp.gap.search import tolerances
-
-STRAIN = 0.003
-"""Fall of chi2 per value, were the tolerance of one effect wider, from which that effect is tried although the
-tolerances close the gap. At most 0.0011 in 10 development nulls; 0.0036 to 0.46, and most for the right effect, in 6
-of 8 with an effect 0.9 to 1.5 tolerances off, at most 0.0011 in the other two (a tilt); 0.018 and 0.030 for two of
-five effects of two tolerances, at most 0.0021 for the other three."""
-
-LEAD = 3.0
-"""How many times less than that of the first may be that of its rivals, between which held-out windows decide."""
-
-MOST = 3
-"""Effects that are tried at most, since each is fitted anew."""
-
-CLEAR = 1.5
-"""Tolerances that an effect must reach to be named where the tolerances close the gap."""
+from go1exp.gap.search import thresholds, tolerances
 
 
 def values(scorer: Scorer, linear: Table) -> float:
@@ -66,4 +51,8 @@ def straining(relieved: Mapping[str, float], count: float, but: Collection[str])
         but: effects that are out of the question.
     """
     order = sorted((e for e in relieved if e not in but), key=lambda e: -relieved[e])
-    return [e for e in order[:MOST] if relieved[e] > max(STRAIN * count, relieved[order[0]] / LEAD)]
+    return [
+        e
+        for e in order[: thresholds.MOST_ACTIVE_BOUNDS]
+        if relieved[e] > max(thresholds.ACTIVE_BOUND * count, relieved[order[0]] / thresholds.RIVAL_RATIO)
+    ]

@@ -16,16 +16,11 @@ from go1exp.config.schema.registry import members
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Key, Probe, Theta
 from go1exp.gap.score.linear import Layout
+from go1exp.gap.search import thresholds
 from go1exp.sim.effects.base import Param
 from go1exp.sim.effects.identification import Identification
 from go1exp.sim.effects.tolerances import Tolerances, effect_class, sizes
 from go1exp.sim.physics import box
-
-PRIOR = 0.5
-"""Standard deviation of a parameter within its tolerance, in tolerances: it settles what the data leave open."""
-
-WIDE = 20.0
-"""The same for a parameter that may leave it."""
 
 
 def identification(effect: str) -> Identification:
@@ -71,14 +66,8 @@ def present(effect: str, theta: Mapping[Key, np.ndarray], machine: Machine) -> n
     return away if away.any() else ~away
 
 
-SMALL = 0.1
-"""Change of a parameter for a derivative, in tolerances. Much that moves a robot can be scaled together and leaves no
-trace; that only shows if columns are exact, and differences over a whole tolerance are not (coulomb and kd were off by
-5 and 9 %)."""
-
-
 def probes(
-    machine: Machine, keys: Sequence[Key], theta: Mapping[Key, np.ndarray], factor: float = SMALL
+    machine: Machine, keys: Sequence[Key], theta: Mapping[Key, np.ndarray], factor: float = thresholds.DIFFERENCE
 ) -> list[Probe]:
     """Return the probes of parameters at their present values."""
     columns: list[Probe] = []
@@ -193,7 +182,7 @@ def bounds(
         low[i] = max(p.low, p.null - reach) - value
         high[i] = min(p.high, p.null + reach) - value
         centre[i] = p.null - value
-        weight[i] = 1.0 / ((WIDE if wide else PRIOR) * unit[i]) ** 2
+        weight[i] = 1.0 / ((thresholds.FREE_PRIOR_SD if wide else thresholds.PRIOR_SD) * unit[i]) ** 2
         if not math.isfinite(p.tolerance) and not _beyond_tolerance(probe.key[0], theta, j, may.tolerances):
             low[i] = high[i] = 0.0
     if not back:
@@ -201,13 +190,9 @@ def bounds(
     return Bounds(low, high, centre, weight)
 
 
-RIDGES = (1e-9, 1e-7, 1e-5)
-"""What is added to a diagonal of ones: float32 sums of products of columns that say the same can be indefinite."""
-
-
 def _definite(matrix: np.ndarray) -> np.ndarray:
     """Return a matrix with a diagonal of ones (n, n), made positive definite by the least of the ridges that does."""
-    for ridge in RIDGES:
+    for ridge in thresholds.RIDGES:
         raised = matrix + ridge * np.eye(len(matrix))
         try:
             np.linalg.cholesky(raised)

@@ -12,18 +12,8 @@ from go1exp.gap.result import GapSettings
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import Layout
 from go1exp.gap.score.robust import excess, removed
-from go1exp.gap.search import evidence, significance, tolerances
+from go1exp.gap.search import evidence, significance, thresholds, tolerances
 from go1exp.gap.search.fit import Model, scores
-from go1exp.gap.search.strain import CLEAR
-
-FEW = 0.5
-"""A candidate that removes more than this share of the excess without being significant is seen in too few windows."""
-
-MANY = 3.0
-"""Times as many values beyond their tolerances that make an effect the less simple of two."""
-
-MOSTLY = 0.7
-"""Share of a small excess, of a model that is adequate already, that a term must remove: the right one leaves none."""
 
 
 @dataclass(frozen=True)
@@ -72,11 +62,11 @@ class Trial:
             return "accepted", f"removes {share:.1%} of the excess on held-out windows, p = {p:.2g}"
         if chosen is not None and self.alias[k]:
             return "alias", f"does as well as {self.names[chosen]}: these data cannot tell them apart"
-        if self.needed < 0.0 and 1.0 < self.sizes[k] <= CLEAR:
+        if self.needed < 0.0 and 1.0 < self.sizes[k] <= thresholds.CLEARLY_BEYOND:
             return "rejected", f"leaves its tolerance by too little ({self.sizes[k]:.2g} of it) to be called missing"
         if self.sizes[k] <= 1.0:
             return "rejected", f"fits within its tolerance ({self.sizes[k]:.2g} of it)"
-        if not self.shown[k] and share > FEW and self.mean[k] > 0:
+        if not self.shown[k] and share > thresholds.FEW_WINDOWS_SHARE and self.mean[k] > 0:
             return "rejected", f"removes {share:.1%} of the excess, but too few windows show it (p = {p:.2g})"
         if self.shown[k] and share > self.needed and self.mean[k] <= 0:
             return "rejected", f"removes {share:.1%} of the excess, but other windows lose as much in log chi2"
@@ -124,12 +114,12 @@ def tried(
         p = (_bic(scorer, fitted, train) >= 0).astype(float)
     before, after = excess(now), [excess(one) for one in chi2]
     share = np.array([removed(before, a) for a in after])
-    needed = settings.min_share if before > settings.adequate else max(MOSTLY, settings.min_share)
+    needed = settings.min_share if before > settings.adequate else max(thresholds.MOST_OF_SMALL, settings.min_share)
     needed = -math.inf if small else needed
     sizes = np.array([evidence.size(m.name, m.theta, m.may.tolerances) for m in fitted])
     shown = significance.shown(p, share, 0.0 if small else before, settings)
     helps = shown & (share > needed) & (gain.mean(axis=1) > 0)
-    outside = helps & (sizes > (CLEAR if small else 1.0))
+    outside = helps & (sizes > (thresholds.CLEARLY_BEYOND if small else 1.0))
     machine = scorer.replayer.machine
     numbers = np.array(
         [(evidence.count(m.name, m.theta, machine), evidence.parameters(m)) for m in fitted], dtype=float
@@ -168,7 +158,7 @@ def _choice(
     # What explains the same with more numbers is no rival: a tilt is two, the offsets that imitate it are twelve.
     equal = alias & (mean >= mean[best] - significance.same(mean[best]))
     clear = alias & ~unclear
-    many = clear & equal & (numbers[:, 0] >= MANY * numbers[clear & equal, 0].min(initial=math.inf))
+    many = clear & equal & (numbers[:, 0] >= thresholds.MANY_TIMES * numbers[clear & equal, 0].min(initial=math.inf))
     rest = clear & ~many
     aside = many | (rest & (numbers[:, 1] > numbers[rest, 1].min(initial=math.inf)))
     alias &= ~aside

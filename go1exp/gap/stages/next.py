@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from go1exp.base.tensors.threads import one_thread
-from go1exp.gap.certainty import HALF_WIDTH
 from go1exp.gap.comparison import Comparison, Progress, compare, robot_from
 from go1exp.gap.data.fingerprint import fingerprint
 from go1exp.gap.design.choice import COARSE, ENOUGH, Choice, choose
@@ -23,8 +22,7 @@ from go1exp.gap.design.settings import DesignSettings
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import Candidate, GapResult, GapSettings, NamedEffect
 from go1exp.gap.robots.protocol import Robot
-from go1exp.gap.search import significance, tolerances
-from go1exp.gap.search.screen import PROBE
+from go1exp.gap.search import significance, thresholds, tolerances
 from go1exp.gap.stages.apply import composed, read_as, terms_of, theta_of
 from go1exp.logs.record.simulate import held_quat
 from go1exp.logs.recording import Recording
@@ -152,7 +150,7 @@ def unseen(result: GapResult, robot: Robot) -> list[Pair]:
     """Return what the recordings did not excite, each against nothing."""
     theta, terms = model_of(result, robot), tuple(n.effect for n in result.named)
     return [
-        Pair(effect, "", _probed(effect, theta, robot), theta, terms, 0.0, significance.SAME)
+        Pair(effect, "", _probed(effect, theta, robot), theta, terms, 0.0, thresholds.SAME_GAIN)
         for effect in result.not_excited
         if effect in tolerances.felt(robot)
     ]
@@ -166,7 +164,7 @@ def _spread(named: NamedEffect, robot: Robot) -> float:
         for place, (low, high) in places.items():
             size = abs(named.params[name][place] - null)
             if size > 0.0 and math.isfinite(high - low):
-                shares.append((high - low) / (2.0 * HALF_WIDTH) / size)
+                shares.append((high - low) / (2.0 * thresholds.HALF_WIDTH) / size)
     return min(float(np.median(shares)), WIDEST) if shares else 0.0
 
 
@@ -190,7 +188,7 @@ def _probed(effect: str, theta: Theta, robot: Robot) -> Theta:
     for key in sizes(effect)[:1]:
         p = robot.tolerances.param(key)
         wide = len(robot.joints) if p.per == "joint" else 1
-        changed[key] = np.full(wide, p.null + tolerances.step(p, None, PROBE))
+        changed[key] = np.full(wide, p.null + tolerances.step(p, None, thresholds.PROBE))
     return changed
 
 
