@@ -34,15 +34,13 @@ from go1exp.config.schema.registry import bind
 from go1exp.config.schema.settings import parse
 from go1exp.evaluate.statistics.intervals import bootstrap_interval
 from go1exp.gap.comparison import Comparison, compare
-from go1exp.gap.design.choice import COARSE, ENOUGH, choose
-from go1exp.gap.design.limits import Limits, limits_of
-from go1exp.gap.design.plan import Attitude, Design, library
-from go1exp.gap.design.power import Judge, Pair
+from go1exp.gap.design.choice import COARSE, ENOUGH, Judge, Pair, choose
+from go1exp.gap.design.plan import Attitude, Design, Limits, library, limits_of
 from go1exp.gap.design.rehearsal import Rehearsal, Stage
 from go1exp.gap.design.settings import DesignSettings
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import GapSettings
-from go1exp.gap.robots.hung import hung
+from go1exp.gap.robots.go1 import hung
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.stages.explain import explain
 from go1exp.logs.record.plan import Episode, make_motion

@@ -16,7 +16,7 @@ from go1exp import cli
 from go1exp.base.paths import data_root
 from go1exp.config.compose import compose
 from go1exp.gap.result import GapSettings
-from go1exp.gap.robots.hung import hung
+from go1exp.gap.robots.go1 import hung
 from go1exp.gap.stages.replay import Part, replay
 from go1exp.logs import recording
 from go1exp.logs.recording import Recording, joint_channels

@@ -55,7 +55,7 @@ from go1exp.deploy.sim_robot.server import TRUTH, Network, Truth
 from go1exp.evaluate.controller.adapters import Deployed
 from go1exp.evaluate.controller.mpc import Mpc
 from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
-from go1exp.gap.robots.hung import hung
+from go1exp.gap.robots.go1 import hung
 from go1exp.logs import recording
 from go1exp.logs.audit import audit
 from go1exp.logs.record.motions import played

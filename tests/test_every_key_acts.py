@@ -1041,7 +1041,7 @@ def gap_trace(container: dict[str, Any], walk: Walk) -> Trace:
     """
     from go1exp.cli.gap import APP, DOES_NOT_HOLD
     from go1exp.gap.result import EXIT_CODES
-    from go1exp.gap.robots import hung
+    from go1exp.gap.robots import go1
     from go1exp.gap.search import tolerances
 
     built: set[tuple[int, int]] = set()
@@ -1053,7 +1053,7 @@ def gap_trace(container: dict[str, Any], walk: Walk) -> Trace:
     few = put(container, "search.effects", ["coulomb", "viscous"])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tolerances, "nominal", lambda robot: ("viscous",))
-        patch.setattr(hung, "MujocoCpu", backend)
+        patch.setattr(go1, "MujocoCpu", backend)
         _, files = outcome(APP, few, walk, (*EXIT_CODES.values(), DOES_NOT_HOLD))
     yield "files", sorted(files)
     yield "batches", sorted(built)

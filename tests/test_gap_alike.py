@@ -7,7 +7,7 @@ import pytest
 
 from go1exp.config.schema.registry import members
 from go1exp.gap.search import thresholds, tolerances
-from go1exp.gap.search.alike import differ
+from go1exp.gap.search.single_cause import differ
 from go1exp.sim.effects.tolerances import declared
 
 TOLERANCE = declared(("encoder_offset", "offset")).tolerance

@@ -21,7 +21,7 @@ from go1exp.config.schema.physics import MUJOCO_CONTACT, ContactConfig
 from go1exp.gap import files
 from go1exp.gap.comparison import prepare
 from go1exp.gap.result import AngleErrors, Candidate, Floors, GapResult, GapSettings, Localisation, NamedEffect, Overlay
-from go1exp.gap.robots.hung import hung
+from go1exp.gap.robots.go1 import hung
 from go1exp.gap.stages.apply import CALIBRATION, COMPENSATING, EFFECT, composed, prove, terms_of, theta_of, write
 from go1exp.gap.stages.explain import explain
 from go1exp.logs.audit import audit

@@ -12,7 +12,7 @@ from go1exp import robot
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import bind
 from go1exp.gap.replay.replayer import LEVEL, hold
-from go1exp.gap.robots.hung import hung
+from go1exp.gap.robots.go1 import hung
 from go1exp.sim.env.plant import Plant
 from go1exp.sim.task import parse_parts
 

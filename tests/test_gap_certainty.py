@@ -1,4 +1,4 @@
-"""What is certified, what only makes up for something, and that the answer says why (``go1exp/gap/certainty.py``)."""
+"""Which terms are certified or compensating, and why (``go1exp/gap/search/certainty.py``)."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from go1exp.gap.answer import Answer, bounded_joints, weak_joints
-from go1exp.gap.certainty import beside_a_gap, doubt, widened
 from go1exp.gap.result import Candidate, GapSettings, NamedEffect
+from go1exp.gap.search.candidates import Trial
+from go1exp.gap.search.certainty import beside_a_gap, doubt, widened
 from go1exp.gap.search.ledger import LastCheck, Ledger
-from go1exp.gap.search.trial import Trial
 from go1exp.gap.sentence import sentence
 from go1exp.sim.effects.tolerances import DECLARED, declared
 
@@ -118,7 +118,7 @@ def test_beside_a_large_effect_a_small_one_is_judged_by_what_is_left_without_it(
 def test_beside_a_gap_a_value_is_as_unsure_as_what_remains_is_large(
     goes: float, half: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("go1exp.gap.certainty.excess", lambda chi2: 16.0)  # of 100 within the tolerances
+    monkeypatch.setattr("go1exp.gap.search.certainty.excess", lambda chi2: 16.0)  # of 100 within the tolerances
     search: Any = Stub(own=goes)
     assert beside_a_gap(search, "coulomb") == pytest.approx(half, rel=1e-3, abs=1e-12)
 
@@ -157,7 +157,7 @@ def test_half_of_the_resamples_are_enough_where_the_gap_is_closed(
 def test_one_joint_alone_is_doubted_where_the_tolerances_do_nearly_as_well(
     joints: int, strained: bool, left: float, sure: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("go1exp.gap.certainty.excess", lambda chi2: chi2)
+    monkeypatch.setattr("go1exp.gap.search.certainty.excess", lambda chi2: chi2)
     search: Any = Stub(first=0.0, strained=strained, select_chi2=left)
     theta = {("coulomb", "bound"): np.full(4, 0.3)}
     assert (doubt(search, "coulomb", theta, JOINTS[:joints], True, BORNE_OUT) == "") is sure

@@ -16,7 +16,7 @@ from go1exp.gap import files
 from go1exp.gap.comparison import _last_check, clock_taken, compare, prepare
 from go1exp.gap.data.clocks import beginnings, rows_of, same_rows
 from go1exp.gap.data.cutting import even_clock
-from go1exp.gap.data.splits import splits
+from go1exp.gap.data.windows import splits
 from go1exp.gap.result import ClockChoice, GapResult, GapSettings
 from go1exp.gap.robots.fixed_base import FixedBase
 from go1exp.gap.score.initial_state import rescaled

@@ -11,8 +11,8 @@ from go1exp.config.compose import compose
 from go1exp.gap.comparison import compare, robot_from
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import GapSettings
+from go1exp.gap.score.likelihood import log_chi2
 from go1exp.gap.score.linear import Layout, Table, borrowed, corrected
-from go1exp.gap.score.robust import log_chi2
 from go1exp.gap.search import state as search_state
 from go1exp.gap.search import tolerances
 from go1exp.gap.search.fit import descend, fit

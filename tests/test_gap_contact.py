@@ -20,16 +20,15 @@ from go1exp.config.schema.physics import MUJOCO_CONTACT, ContactConfig
 from go1exp.config.schema.registry import ConfigError, bind
 from go1exp.gap import files
 from go1exp.gap.comparison import prepare
-from go1exp.gap.data.contact import contact_of, contact_warnings, tolerances_of, too_coarse
-from go1exp.gap.data.splits import splits
+from go1exp.gap.data.prepare import contact_of, contact_warnings, tolerances_of, too_coarse
+from go1exp.gap.data.windows import splits
 from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.rows import null, variants
 from go1exp.gap.report import tables
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
 from go1exp.gap.robots.choice import robot_of
 from go1exp.gap.robots.description import parse_model
-from go1exp.gap.robots.hung import HungGo1
-from go1exp.gap.robots.standing import StandingGo1
+from go1exp.gap.robots.go1 import HungGo1, StandingGo1
 from go1exp.gap.score.initial_state import settled
 from go1exp.gap.search import profile_likelihood, tolerances
 from go1exp.gap.search.screen import Motion, library

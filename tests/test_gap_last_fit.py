@@ -15,8 +15,8 @@ from go1exp.gap.replay.rows import Probe, Theta
 from go1exp.gap.result import GapSettings
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import Table, unbiased_grams
-from go1exp.gap.search import state
-from go1exp.gap.search.last_fit import opposite, resampled_values, semidefinite
+from go1exp.gap.search import thresholds
+from go1exp.gap.search.certainty import opposite, resampled_values, semidefinite
 from go1exp.gap.search.state import State
 from go1exp.gap.search.stepwise import Search
 from go1exp.sim.effects.tolerances import DECLARED
@@ -30,7 +30,7 @@ QUICK = GapSettings(stride_s=0.4, window_s=0.2, effects=("command_delay",), boot
 
 def delays(monkeypatch: pytest.MonkeyPatch, finer: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the delay (J,) and its resamples (B, J), s, of a robot whose drives obey late, stepped finely."""
-    monkeypatch.setattr(state, "FINER", finer)
+    monkeypatch.setattr(thresholds, "FINER_STEPS", finer)
     hidden = ["effect=command_delay", f"effect.command_delay.delay={HIDDEN_S}", "physics_dt=0.000125"]
     _, logs = recorded(["seconds=2", "excitation=[steps]", "gains=[[20,0.5],[35,0.6],[35,1.2]]", *hidden])
     config = parse_parts(compose("gap", ["logs=none"]), ("robot",))[0]["robot"]

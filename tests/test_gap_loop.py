@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from go1exp.cli import main
-from go1exp.gap.design.limits import DesignError, Used
-from go1exp.gap.design.plan import Attitude, Design
-from go1exp.gap.design.power import Worth
+from go1exp.gap.design.choice import Worth
+from go1exp.gap.design.plan import Attitude, Design, DesignError, Used
 from go1exp.gap.design.rehearsal import Rehearsal
 from go1exp.gap.design.settings import DesignSettings
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect

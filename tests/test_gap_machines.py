@@ -28,9 +28,9 @@ from go1exp.gap.result import GapSettings
 from go1exp.gap.robots.choice import robot_of
 from go1exp.gap.robots.description import ModelConfig, parse_model
 from go1exp.gap.robots.fixed_base import FixedBase
-from go1exp.gap.robots.hung import HungGo1
+from go1exp.gap.robots.go1 import HungGo1
 from go1exp.gap.search import tolerances
-from go1exp.gap.search.last_fit import resampled_values
+from go1exp.gap.search.certainty import resampled_values
 from go1exp.gap.search.ledger import LastCheck
 from go1exp.gap.search.stepwise import Search
 from go1exp.gap.stages.explain import explain

@@ -14,8 +14,7 @@ from go1exp.base.paths import data_root
 from go1exp.config.schema import registry
 from go1exp.config.schema.registry import members
 from go1exp.gap import answer, sentence
-from go1exp.gap.robots.hung import HungGo1
-from go1exp.gap.robots.standing import StandingGo1
+from go1exp.gap.robots.go1 import HungGo1, StandingGo1
 from go1exp.gap.score.linear import Layout
 from go1exp.gap.search import tolerances
 from go1exp.gap.search.screen import Motion, free_shapes, library

@@ -19,18 +19,15 @@ from go1exp.cli.gap_next import text
 from go1exp.config.schema.registry import bind
 from go1exp.gap import files as gap_files
 from go1exp.gap.comparison import Comparison, compare
-from go1exp.gap.design.choice import ENOUGH, choose
-from go1exp.gap.design.limits import DesignError, Limits, limits_of
-from go1exp.gap.design.plan import Attitude, Design, library, neighbours
-from go1exp.gap.design.power import Judge, Pair, Worth, power
-from go1exp.gap.design.rehearsal import Stage
+from go1exp.gap.design.choice import ENOUGH, Judge, Pair, Worth, choose, power
+from go1exp.gap.design.plan import Attitude, Design, DesignError, Limits, library, limits_of, neighbours
+from go1exp.gap.design.rehearsal import Stage, write
 from go1exp.gap.design.settings import DesignSettings, Safety
-from go1exp.gap.design.written import write
 from go1exp.gap.replay.rows import Theta, variants
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
 from go1exp.gap.robots.description import ModelConfig
 from go1exp.gap.robots.fixed_base import FixedBase
-from go1exp.gap.robots.hung import hung
+from go1exp.gap.robots.go1 import hung
 from go1exp.gap.score.linear import Layout
 from go1exp.gap.search import tolerances
 from go1exp.gap.stages import next as stage_next

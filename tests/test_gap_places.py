@@ -1,4 +1,4 @@
-"""Which joints, and which name: sparse places (``go1exp/gap/search/places.py``) and the simpler of two."""
+"""Which joints, and which name: sparse places (``go1exp/gap/search/reduction.py``) and the simpler of two."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import pytest
 
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.score.linear import Layout
-from go1exp.gap.search import evidence, places, reduction, thresholds, tolerances
+from go1exp.gap.search import candidates, reduction, thresholds, tolerances
+from go1exp.gap.search.candidates import _choice
 from go1exp.gap.search.screen import Motion, Screened, Variant, library, rivals
 from go1exp.gap.search.tolerances import Freedom
-from go1exp.gap.search.trial import _choice
 from go1exp.robot import JOINTS
 from go1exp.sim.effects.tolerances import DECLARED
 
@@ -47,7 +47,7 @@ class Quadratic:
 def at(cost: np.ndarray, gain: np.ndarray | None = None) -> set[str]:
     theta = {("link_mass", "scale"): np.full(12, 1.6)}
     linear: Any = Quadratic(theta, cost, 0.01 * cost if gain is None else gain)
-    inside = places.chosen(linear, "link_mass", frozenset(), np.random.default_rng(0))
+    inside = reduction.chosen(linear, "link_mass", frozenset(), np.random.default_rng(0))
     return {JOINTS[j] for j in inside}
 
 
@@ -81,9 +81,9 @@ def test_fewer_joints_that_lose_little_are_to_be_fitted_the_fewest_first() -> No
     cost[[3, 4, 5]] = 20.0, 120.0, 260.0
     linear: Any = Quadratic({("link_mass", "scale"): np.full(12, 1.6)}, cost, np.zeros(12))
     sets = [{5}, {3, 4, 5}, {2, 5, 8, 11}, {3, 4, 5, 9, 10, 11}]
-    assert places.fewer(linear, "link_mass", frozenset()) == sets
+    assert reduction.fewer(linear, "link_mass", frozenset()) == sets
     linear.theta = {("link_mass", "scale"): np.where(np.arange(12) == 5, 1.6, 1.05)}
-    assert places.fewer(linear, "link_mass", frozenset()) == []  # the others are within their tolerance
+    assert reduction.fewer(linear, "link_mass", frozenset()) == []  # the others are within their tolerance
 
 
 def test_a_value_on_its_tolerance_is_not_beyond_it() -> None:
@@ -91,22 +91,22 @@ def test_a_value_on_its_tolerance_is_not_beyond_it() -> None:
     p = DECLARED.param(("link_mass", "scale"))
     on, beyond = (np.full(12, p.null + far * p.tolerance) for far in (1.0, 1.001))
     assert abs(on[0] - p.null) > p.tolerance
-    assert not evidence.beyond("link_mass", {("link_mass", "scale"): on}, JOINTS, DECLARED).any()
-    assert evidence.beyond("link_mass", {("link_mass", "scale"): beyond}, JOINTS, DECLARED).all()
+    assert not candidates.beyond("link_mass", {("link_mass", "scale"): on}, JOINTS, DECLARED).any()
+    assert candidates.beyond("link_mass", {("link_mass", "scale"): beyond}, JOINTS, DECLARED).all()
 
 
 def test_joints_that_are_within_their_tolerance_are_not_asked() -> None:
     scale = np.ones(12)
     scale[3] = 2.0
     linear: Any = Quadratic({("link_mass", "scale"): scale}, np.full(12, 500.0), np.zeros(12))
-    assert places.chosen(linear, "link_mass", frozenset(), np.random.default_rng(0)) == {3}
+    assert reduction.chosen(linear, "link_mass", frozenset(), np.random.default_rng(0)) == {3}
 
 
 def test_pieces_are_joints_parts_legs_sides_and_all() -> None:
-    sets = {frozenset(JOINTS[j] for j in piece) for piece in places.pieces(JOINTS)}
+    sets = {frozenset(JOINTS[j] for j in piece) for piece in reduction.pieces(JOINTS)}
     assert len(sets) == 12 + 3 + 4 + 4 + 1
     assert frozenset(j for j in JOINTS if j[1] == "R") in sets  # the right side
-    assert places.pieces(["shoulder", "elbow"]) == [frozenset([0]), frozenset([1]), frozenset([0, 1])]
+    assert reduction.pieces(["shoulder", "elbow"]) == [frozenset([0]), frozenset([1]), frozenset([0, 1])]
 
 
 # ---------------------------------------------------------------------- names
@@ -116,7 +116,7 @@ def test_a_tilt_is_simpler_than_the_twelve_offsets_that_imitate_it() -> None:
     offsets = {("encoder_offset", "offset"): np.full(12, 0.02)}
     tilt = {("base_tilt", "roll"): np.array([0.03]), ("base_tilt", "pitch"): np.array([-0.02])}
     values = [("encoder_offset", offsets), ("base_tilt", tilt)]
-    numbers = np.array([(evidence.count(name, theta, MACHINE), len(theta)) for name, theta in values], dtype=float)
+    numbers = np.array([(candidates.count(name, theta, MACHINE), len(theta)) for name, theta in values], dtype=float)
     gain = np.random.default_rng(0).normal(2.0, 0.1, (2, 60))
     gain[1] = gain[0] - 0.01  # half a per cent less: the same
     all_out, none = np.ones(2, dtype=bool), np.zeros(2, dtype=bool)

@@ -149,8 +149,8 @@ def test_a_term_is_kept_to_the_fewest_joints_that_held_out_windows_allow(
         return np.exp(missed + (noise if kept else 0.0)) * (1.5 if left else 9.0)
 
     theta = {("link_mass", "scale"): np.where(np.isin(np.arange(12), (3, 4, 5)), 1.6, 1.0)}
-    monkeypatch.setattr(reduction.places, "Linear", lambda state: state)
-    monkeypatch.setattr(reduction.places, "fewer", lambda linear, name, kept: [frozenset({3}), frozenset({5})])
+    monkeypatch.setattr(reduction, "Linear", lambda state: state)
+    monkeypatch.setattr(reduction, "fewer", lambda linear, name, kept: [frozenset({3}), frozenset({5})])
     asked = search(Known(lambda terms: 1.0, ("link_mass",), theta, worse=worse))
     reduction.concentrate(asked, "link_mass")
     assert {3, 4, 5} - {j for _, j in asked.state.kept} == joints

@@ -1,4 +1,4 @@
-"""How wrong a model is: windows at rest and wild windows must not decide (``go1exp/gap/score/robust.py``)."""
+"""How wrong a model is: windows at rest and wild windows must not decide (``go1exp/gap/score/likelihood.py``)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import go1exp.gap
 from go1exp.gap.report import words
 from go1exp.gap.result import GapSettings
 from go1exp.gap.score.angle_errors import angle_errors
-from go1exp.gap.score.robust import KNEE, excess, log_chi2, removed
+from go1exp.gap.score.likelihood import KNEE, excess, log_chi2, removed
 from go1exp.gap.search import significance
 
 

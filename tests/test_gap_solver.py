@@ -15,15 +15,14 @@ from go1exp.cli.record import RIG
 from go1exp.config.compose import compose
 from go1exp.gap.comparison import compare
 from go1exp.gap.data.cutting import even_clock, noise
-from go1exp.gap.data.splits import splits
-from go1exp.gap.data.windows import held
+from go1exp.gap.data.windows import held, splits
 from go1exp.gap.replay.replayer import padded
 from go1exp.gap.replay.rows import Probe
 from go1exp.gap.result import EXIT_CODES, GapResult, GapSettings
-from go1exp.gap.robots.hung import HungGo1, hung
+from go1exp.gap.robots.go1 import HungGo1, hung
 from go1exp.gap.score.likelihood import gram
 from go1exp.gap.score.linear import Layout, predicted
-from go1exp.gap.search import significance, stepwise, strain, thresholds
+from go1exp.gap.search import significance, stepwise, thresholds, tolerances
 from go1exp.gap.search.fit import Model, scores
 from go1exp.gap.search.significance import max_t
 from go1exp.gap.search.tolerances import Bounds, Freedom, solve
@@ -284,12 +283,12 @@ def test_few_windows_are_enough_for_what_removes_most_of_a_gap(
 def test_what_strains_most_is_tried_with_its_rivals() -> None:
     relief = {"armature": 900.0, "link_mass": 200.0, "strength": 100.0}
     values = 900.0 / (2.0 * thresholds.ACTIVE_BOUND)
-    assert strain.straining(relief, values, []) == ["armature"]
-    assert strain.straining(relief, 3.0 * values, []) == []
-    assert strain.straining(relief, values, ["armature"]) == []  # 200 is too little
-    assert strain.straining(relief | {"link_mass": 601.0}, values, []) == ["armature", "link_mass"]
-    assert strain.straining(relief | {"armature": 3000.0, "link_mass": 900.0}, values, []) == ["armature"]
-    assert strain.straining({}, values, []) == []
+    assert tolerances.straining(relief, values, []) == ["armature"]
+    assert tolerances.straining(relief, 3.0 * values, []) == []
+    assert tolerances.straining(relief, values, ["armature"]) == []  # 200 is too little
+    assert tolerances.straining(relief | {"link_mass": 601.0}, values, []) == ["armature", "link_mass"]
+    assert tolerances.straining(relief | {"armature": 3000.0, "link_mass": 900.0}, values, []) == ["armature"]
+    assert tolerances.straining({}, values, []) == []
 
 
 @pytest.mark.parametrize(("third", "expected"), [(1.0, ["viscous", "kd_scale"]), (300.0, [])])

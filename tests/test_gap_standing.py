@@ -13,20 +13,17 @@ from scipy.spatial.transform import Rotation
 
 import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
 from go1exp.gap.comparison import prepare
-from go1exp.gap.data.splits import splits
-from go1exp.gap.data.standing import StandingWindows
-from go1exp.gap.data.trunk import AGREE, Base, Log, base_state
+from go1exp.gap.data.standing import AGREE, Base, Log, StandingWindows, base_state
+from go1exp.gap.data.windows import splits
 from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.rows import Probe, Theta, variants
-from go1exp.gap.replay.standing import StandingReplayer
+from go1exp.gap.replay.walking import StandingReplayer
 from go1exp.gap.result import GapSettings
-from go1exp.gap.robots.hung import HungGo1
-from go1exp.gap.robots.standing import StandingGo1
+from go1exp.gap.robots.go1 import HungGo1, StandingGo1
+from go1exp.gap.score.angle_errors import ON_FEET, REGIMES, localise
 from go1exp.gap.score.initial_state import settled
-from go1exp.gap.score.likelihood import Scorer
-from go1exp.gap.score.localise import ON_FEET, REGIMES, localise
-from go1exp.gap.score.robust import excess
-from go1exp.gap.search import places, profile_likelihood, single_cause
+from go1exp.gap.score.likelihood import Scorer, excess
+from go1exp.gap.search import profile_likelihood, reduction, single_cause
 from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.state import State
 from go1exp.gap.search.stepwise import Search
@@ -310,7 +307,7 @@ def test_the_drives_of_one_part_may_be_off_together_within_their_tolerances(
 
     monkeypatch.setattr(profile_likelihood, "chi2", made_up)
     begin: Theta = {keys[0]: np.full(12, others)}
-    theta = profile_likelihood.at_one_part(score, begin, keys, places.parts(JOINTS), np.arange(2), 0.002)
+    theta = profile_likelihood.at_one_part(score, begin, keys, reduction.parts(JOINTS), np.arange(2), 0.002)
     if hips == others:
         assert theta == begin  # nothing fits better, so nothing changes
         return

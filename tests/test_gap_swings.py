@@ -11,19 +11,15 @@ import pytest
 
 from go1exp.gap.comparison import Comparison, NotComparable, compare
 from go1exp.gap.data.cutting import Place
+from go1exp.gap.data.standing import LOADED, Log
 from go1exp.gap.data.swings import SwingWindows, TrunkMotion, foot_forces, places, swings
-from go1exp.gap.data.trunk import LOADED, Log
 from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.rows import Theta, variants
-from go1exp.gap.replay.swinging import SwingReplayer, packed_by_leg
+from go1exp.gap.replay.walking import SwingReplayer, packed_by_leg
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
-from go1exp.gap.robots.hung import HungGo1
-from go1exp.gap.robots.standing import StandingGo1
-from go1exp.gap.robots.swinging import SwingingGo1
-from go1exp.gap.score.angle_errors import of_angles
-from go1exp.gap.score.likelihood import state_probes
-from go1exp.gap.score.localise import localise
-from go1exp.gap.score.robust import excess
+from go1exp.gap.robots.go1 import HungGo1, StandingGo1, SwingingGo1
+from go1exp.gap.score.angle_errors import localise, of_angles
+from go1exp.gap.score.likelihood import excess, state_probes
 from go1exp.gap.search import tolerances
 from go1exp.gap.search.fit import residuals
 from go1exp.gap.stages import explain as stages_explain

@@ -24,8 +24,8 @@ from go1exp.gap.report import tables, text, write_report
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
 from go1exp.gap.robots.choice import robot_of
 from go1exp.gap.robots.description import parse_model
-from go1exp.gap.robots.hung import hung
-from go1exp.gap.search import evidence, tolerances
+from go1exp.gap.robots.go1 import hung
+from go1exp.gap.search import candidates, tolerances
 from go1exp.gap.stages.apply import prove, write
 from go1exp.gap.stages.explain import explain
 from go1exp.logs.recording import Recording
@@ -109,7 +109,7 @@ def test_a_user_gives_tolerances_on_the_command_line(
     assert may.reach(key, 0) == tolerance
     assert may.also(key[0]).reach(key, 0) == math.inf
     theta = {key: robot.tolerances.param(key).null + 2.0 * tolerance * np.ones(1)}
-    assert evidence.size(key[0], theta, robot.tolerances) == pytest.approx(2.0)
+    assert candidates.size(key[0], theta, robot.tolerances) == pytest.approx(2.0)
 
 
 def test_a_user_gives_tolerances_of_the_go1_in_a_file(tmp_path: Path) -> None:

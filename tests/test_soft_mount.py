@@ -28,7 +28,7 @@ from go1exp.gap.replay.rows import Rows, Theta, bolted, mounted, variants
 from go1exp.gap.result import GapSettings
 from go1exp.gap.robots.description import ModelConfig, parse_model
 from go1exp.gap.robots.fixed_base import FixedBase
-from go1exp.gap.robots.hung import hung
+from go1exp.gap.robots.go1 import hung
 from go1exp.gap.score.angle_errors import unexplained
 from go1exp.gap.score.likelihood import state_probes
 from go1exp.gap.search.fit import stacked

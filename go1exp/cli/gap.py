@@ -189,9 +189,9 @@ def _check(recordings: list[Recording], robot: Robot, settings: GapVerb) -> int:
 def _localise(recordings: list[Recording], robot: Robot, settings: GapVerb) -> int:
     """Print where the plain model is wrong."""
     from go1exp.gap.report import localisation_text
-    from go1exp.gap.stages.localise import localise
+    from go1exp.gap.stages.check import check
 
-    result = localise(recordings, robot, settings.search, _progress())
+    result = check(recordings, robot, settings.search, _progress(), screen=False)
     if result.where is not None:
         print(f"\n{localisation_text(result.where)}")
     return result.exit_code

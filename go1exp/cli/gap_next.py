@@ -88,7 +88,7 @@ def _next(container: dict[str, Any]) -> int:
     out = Path(settings.out)
     answer = files.load(out)
 
-    from go1exp.gap.design.limits import DesignError
+    from go1exp.gap.design.plan import DesignError
     from go1exp.gap.robots.choice import robot_of
     from go1exp.gap.stages.next import design
 
@@ -111,7 +111,7 @@ def written(result: NextResult) -> tuple[str, ...]:
 
 def save(result: NextResult, out: Path) -> None:
     """Write the files of a result into a folder; one of an earlier result that this one has not goes."""
-    from go1exp.gap.design.written import write
+    from go1exp.gap.design.rehearsal import write
 
     (out / TARGETS).unlink(missing_ok=True)
     if result.best:

@@ -10,17 +10,16 @@ from typing import Literal
 import numpy as np
 
 from go1exp.config.schema.registry import members
-from go1exp.gap.certainty import beside_a_gap, doubt, widened
 from go1exp.gap.replay.rows import Key, Theta
 from go1exp.gap.result import Candidate, NamedEffect, Verdict
 from go1exp.gap.robots.fixed_base import FixedBase
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score import angle_errors
-from go1exp.gap.score.robust import excess, removed
+from go1exp.gap.score.likelihood import excess, removed
 from go1exp.gap.search import reduction, thresholds, tolerances
-from go1exp.gap.search.evidence import beyond, bounded, deviation, inaudible
+from go1exp.gap.search.candidates import beyond, bounded, deviation, inaudible
+from go1exp.gap.search.certainty import beside_a_gap, doubt, resampled_values, widened
 from go1exp.gap.search.fit import residuals
-from go1exp.gap.search.last_fit import resampled_values
 from go1exp.gap.search.ledger import LastCheck
 from go1exp.gap.search.stepwise import Search
 from go1exp.sim.effects.base import Param

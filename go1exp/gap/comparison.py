@@ -10,17 +10,15 @@ import numpy as np
 
 from go1exp.base.errors import Expected
 from go1exp.gap.data.clocks import rows_of, same_rows
-from go1exp.gap.data.contact import too_coarse
 from go1exp.gap.data.cutting import Place
-from go1exp.gap.data.prepare import Ready
-from go1exp.gap.data.splits import Splits, splits, stretches
-from go1exp.gap.data.windows import Windows
+from go1exp.gap.data.prepare import Ready, too_coarse
+from go1exp.gap.data.windows import Splits, Windows, splits, stretches
 from go1exp.gap.replay.replayer import LEVEL
 from go1exp.gap.result import DEFAULT_CLOCK, Clock, ClockChoice, Floors, GapSettings
 from go1exp.gap.robots.fixed_base import FixedBase
-from go1exp.gap.robots.hung import hung
+from go1exp.gap.robots.go1 import hung
 from go1exp.gap.robots.protocol import Robot
-from go1exp.gap.score.floors import measured, repeatability
+from go1exp.gap.score.initial_state import measured, repeatability
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.search.clocks import OF_CLOCK, Contestant, contest, details
 from go1exp.logs.audit import audit, clock_flaws

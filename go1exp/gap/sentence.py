@@ -10,9 +10,9 @@ import numpy as np
 
 from go1exp.gap.answer import Answer
 from go1exp.gap.result import NamedEffect, Verdict
-from go1exp.gap.score.robust import removed
+from go1exp.gap.score.likelihood import removed
 from go1exp.gap.search import thresholds, tolerances
-from go1exp.gap.search.evidence import deviation
+from go1exp.gap.search.candidates import deviation
 from go1exp.gap.search.screen import free_shapes
 from go1exp.gap.search.stepwise import Search
 from go1exp.sim.effects.tolerances import Tolerances, declared, effect_class, sizes

@@ -18,8 +18,7 @@ from scipy.signal import savgol_filter
 
 from go1exp import robot
 from go1exp.gap.data.cutting import FIT_S, Place, cut, noise_of
-from go1exp.gap.data.standing import IMU_BIAS_SD, IMU_DELAY_SD
-from go1exp.gap.data.trunk import LOADED, Log
+from go1exp.gap.data.standing import IMU_BIAS_SD, IMU_DELAY_SD, LOADED, Log
 from go1exp.gap.data.windows import PAST_S, Windows
 from go1exp.gap.result import GapSettings
 from go1exp.logs.recording import Recording, RecordingError

@@ -5,14 +5,15 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from go1exp.base.files import write_text
 from go1exp.gap.comparison import Comparison
 from go1exp.gap.data.prepare import Ready
 from go1exp.gap.data.windows import Windows
-from go1exp.gap.design.limits import Limits, Used
-from go1exp.gap.design.plan import Design
+from go1exp.gap.design.plan import Design, Limits, Used
 from go1exp.gap.replay.rows import Theta, variants
 from go1exp.gap.score.likelihood import Scorer, scorer
 from go1exp.logs.excitations import Motion
@@ -195,3 +196,26 @@ def _later(recording: Recording, seconds: float) -> Recording:
     if keep.sum() < 2:
         raise RecordingError(f"{recording.meta.episode}: shorter than {seconds:g} s")
     return Recording(recording.meta, {name: values[keep] for name, values in recording.channels.items()})
+
+
+def table(played: Rehearsal, joints: tuple[str, ...], period: float) -> str:
+    """Return a design as a CSV: t in s, targets in rad, gains in N m/rad and N m s/rad, and whether drives are on.
+
+    ``go1exp record`` plays it as the excitation ``playback``, and takes the gains from its own setting ``gains``.
+    """
+    rows = len(played.motion.target)
+    names = ["t", *joint_channels("q_target", joints), *joint_channels("kp", joints), *joint_channels("kd", joints)]
+    gains = np.tile(np.concatenate([played.kp, played.kd]), (rows, 1))
+    t = np.arange(rows)[:, None] * period
+    values = np.concatenate([t, played.motion.target, gains], axis=1)
+    lines = [",".join([*names, FLAG])]
+    for row, on in zip(values, played.motion.torque_enable, strict=True):
+        lines.append(",".join([f"{row[0]:.6f}", *(f"{v:.5f}".rstrip("0").rstrip(".") for v in row[1:]), str(int(on))]))
+    return "\n".join(lines) + "\n"
+
+
+def write(played: Rehearsal, joints: tuple[str, ...], period: float, path: Path) -> Path:
+    """Write a design and return its file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_text(path, table(played, joints, period))
+    return path

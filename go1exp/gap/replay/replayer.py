@@ -13,8 +13,7 @@ from torch import Tensor
 import go1exp.sim.effects  # noqa: F401  (registers every effect)
 from go1exp.config.schema.registry import bind
 from go1exp.gap.data.windows import PAST_S, Windows, averaged, held
-from go1exp.gap.replay.machine import Machine
-from go1exp.gap.replay.rows import Rows, bolted, mounted
+from go1exp.gap.replay.rows import Machine, Rows, bolted, mounted
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.effects.base import Measured
 from go1exp.sim.env.plant import FRICTION, Plant

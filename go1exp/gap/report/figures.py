@@ -12,7 +12,7 @@ import numpy as np
 import go1exp.gap.report.words as words
 from go1exp.base.report.plots import COLOURS, GREY, PAGE, SHADE, WIDE, WIDTH, Drawing, listing
 from go1exp.base.report.table import number, share
-from go1exp.gap.data.contact import tolerances_of
+from go1exp.gap.data.prepare import tolerances_of
 from go1exp.gap.result import GapResult, NamedEffect, Overlay
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ import numpy as np
 import go1exp.gap.report.words as words
 from go1exp.base.report.table import NOTHING, Cell, Row, Table, number, verdict
 from go1exp.config.schema.physics import contact_text
-from go1exp.gap.data.contact import tolerances_of
+from go1exp.gap.data.prepare import tolerances_of
 from go1exp.gap.result import Candidate, GapResult, Localisation
 
 SMALLEST = 0.1

@@ -6,7 +6,7 @@ from go1exp.config.schema.physics import ContactConfig
 from go1exp.config.schema.registry import ConfigError
 from go1exp.gap.robots.description import Go1Model, ModelConfig
 from go1exp.gap.robots.fixed_base import FixedBase
-from go1exp.gap.robots.hung import hung
+from go1exp.gap.robots.go1 import hung
 from go1exp.gap.robots.protocol import Robot
 from go1exp.robot.config import RobotConfig
 from go1exp.sim.effects.tolerances import Tolerances

@@ -17,8 +17,8 @@ from go1exp.config.schema.registry import ConfigError, Entry, Term
 from go1exp.gap.data.cutting import Place, cut
 from go1exp.gap.data.prepare import Ready, noise_in_time, spaced
 from go1exp.gap.data.windows import Windows
-from go1exp.gap.replay.machine import pd, voltage
 from go1exp.gap.replay.replayer import Replayer
+from go1exp.gap.replay.rows import pd, voltage
 from go1exp.gap.result import Clock, GapSettings, Phase
 from go1exp.gap.robots.completion import clock_warnings, completed, flaws_of, gain_warnings, wrong_speeds
 from go1exp.gap.robots.description import ModelConfig

@@ -1,16 +1,37 @@
-"""What every way of looking at a Go1 has in common: its drives, and which logs of it can be compared."""
+"""The Go1 as ``gap`` replays it: suspended, standing, or in swing phases."""
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, cast
+
+import numpy as np
 
 from go1exp import robot
+from go1exp.base.tensors.randomness import EnvRandom
+from go1exp.config.schema.physics import MUJOCO_CONTACT, ContactConfig
 from go1exp.config.schema.registry import Term
-from go1exp.gap.replay.machine import pd
-from go1exp.gap.robots.go1_logs import go1_flaws
+from go1exp.gap.data.cutting import cut
+from go1exp.gap.data.prepare import Ready, contact_of, contact_warnings
+from go1exp.gap.data.standing import StandingWindows, cut_standing, for_feet
+from go1exp.gap.data.swings import SwingWindows, cut_swings, for_swings
+from go1exp.gap.data.windows import Windows
+from go1exp.gap.replay.replayer import Replayer
+from go1exp.gap.replay.rows import Machine, pd
+from go1exp.gap.replay.walking import HEAVY, StandingReplayer, SwingReplayer
+from go1exp.gap.result import GapSettings, Phase
+from go1exp.gap.robots.completion import ONE_GROUP, go1_flaws
+from go1exp.gap.robots.protocol import Robot
 from go1exp.logs.audit import AuditReport
 from go1exp.logs.recording import Recording
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.robot.config import RobotConfig
+from go1exp.sim.effects.tolerances import DECLARED, Tolerances
+from go1exp.sim.env.plant import actuator_setup
+from go1exp.sim.physics.mujoco_cpu import MujocoCpu
+from go1exp.sim.physics.scene import build_model, weigh_down
+from go1exp.sim.terrain import TerrainConfig, build_terrain
 
 
 class Go1:
@@ -40,3 +61,198 @@ class Go1:
     def flaws(self, recording: Recording, report: AuditReport) -> list[str]:
         """Return why a recording cannot be compared, a line each."""
         return go1_flaws(recording, report, self.joints, free=self.free_trunk)
+
+
+NO_SENSORS = 1 << 13
+"""MuJoCo's mjDSBL_SENSOR: the IMU's readings follow from the motion of the base, and those of contacts cost time."""
+
+BASE_PROBE = (5.0e-4, 1.0e-3, 1.0e-3, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01)
+"""Changes of a base's initial height, roll, pitch, velocity and rate by which their influence is measured."""
+
+
+ON_MUJOCO = DECLARED.on(MUJOCO_CONTACT)
+
+
+@dataclass(frozen=True)
+class StandingGo1(Go1):
+    """A Go1 that stands or moves on flat ground, its trunk free.
+
+    Attributes:
+        config: of the robot.
+        held: the same robot with its trunk held, for recordings of it that were made so.
+        joints: names.
+        groups: all joints in one.
+        base_probe: as for :class:`~go1exp.gap.replay.machine.Machine`.
+        on_ground: yes.
+        tolerances: of nominal parameters, about the values of this contact.
+        contact: of the feet.
+        free_trunk: yes.
+    """
+
+    config: RobotConfig
+    held: Machine
+    joints: tuple[str, ...] = robot.JOINTS
+    groups: tuple[tuple[int, ...], ...] = ONE_GROUP
+    base_probe: tuple[float, ...] = BASE_PROBE
+    on_ground: bool = True
+    tolerances: Tolerances = ON_MUJOCO
+    contact: ContactConfig = MUJOCO_CONTACT
+    free_trunk: ClassVar[bool] = True
+
+    def build(
+        self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False
+    ) -> tuple[Any, ActuatorSetup]:
+        """Return a backend with ``num`` free robots, and their drives; ``base_quat`` is not used."""
+        ground = build_terrain(TerrainConfig(kind="flat"))
+        model, blocks = build_model(self.config, ground, physics_dt, contact=self.contact)
+        model.opt.disableflags |= NO_SENSORS
+        backend = MujocoCpu(model, blocks, num, threads)
+        return backend, actuator_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
+
+    def suited(self, recordings: Sequence[Recording], phase: Phase = "whole") -> StandingGo1:
+        """Return itself: it can be compared with recordings of a held trunk too."""
+        return self
+
+    def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
+        """Return the recordings as they are, with windows that suit contact."""
+        warnings = tuple(contact_warnings(recordings, self.contact))
+        return Ready(tuple(recordings), for_feet(settings, recordings), warnings=warnings)
+
+    def windows(self, ready: Ready) -> StandingWindows:
+        """Cut recordings into windows that begin where at least two feet carry weight."""
+        return cut_standing(ready.recordings, ready.settings, self.config)
+
+    def replayer(self, windows: Windows, quats: np.ndarray, max_rows: int, threads: int) -> Replayer:
+        """Return what replays windows on the feet, and those of a held trunk among them."""
+        standing = cast(StandingWindows, windows)  # that this robot cut
+        return StandingReplayer(self, standing, quats, max_rows, threads, held=self.held)
+
+
+IMU_PROBE = (0.1, 0.1, 0.1, 0.02, 0.02, 0.02, 0.0005)
+"""Errors of accelerometer, m/s2, gyro, rad/s, and delay, s, by which the influence of the IMU is measured."""
+
+
+@dataclass(frozen=True)
+class SwingingGo1(Go1):
+    """A Go1 that walks, of which the legs in the air are compared.
+
+    Attributes:
+        config: of the robot.
+        joints: names.
+        groups: all joints in one, since which legs swing changes from window to window.
+        base_probe: errors of the IMU.
+        on_ground: no: what acts on the trunk or on feet is not felt.
+        tolerances: of nominal parameters.
+        free_trunk: yes.
+    """
+
+    config: RobotConfig
+    joints: tuple[str, ...] = robot.JOINTS
+    groups: tuple[tuple[int, ...], ...] = ONE_GROUP
+    base_probe: tuple[float, ...] = IMU_PROBE
+    on_ground: bool = False
+    tolerances: Tolerances = DECLARED
+    free_trunk: ClassVar[bool] = True
+
+    def build(
+        self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False
+    ) -> tuple[Any, ActuatorSetup]:
+        """Return a backend with ``num`` robots in the air on heavy trunks, and their drives."""
+        model, blocks = build_model(self.config, None, physics_dt)
+        weigh_down(model, HEAVY)
+        backend = MujocoCpu(model, blocks, num, threads)
+        return backend, actuator_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
+
+    def suited(self, recordings: Sequence[Recording], phase: Phase = "swing") -> SwingingGo1:
+        """Return itself."""
+        return self
+
+    def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
+        """Return the recordings as they are, with windows that suit swings."""
+        return Ready(tuple(recordings), for_swings(settings))
+
+    def windows(self, ready: Ready) -> SwingWindows:
+        """Cut recordings into windows of legs in the air."""
+        return cut_swings(ready.recordings, ready.settings, self.config)
+
+    def replayer(self, windows: Windows, quats: np.ndarray, max_rows: int, threads: int) -> Replayer:
+        """Return what replays windows of legs in the air."""
+        return SwingReplayer(self, cast(SwingWindows, windows), quats, max_rows, threads)
+
+
+LEGS = tuple(tuple(range(3 * leg, 3 * leg + 3)) for leg in range(robot.NUM_LEGS))
+
+
+@dataclass(frozen=True)
+class HungGo1(Go1):
+    """A Go1 whose trunk is held, so that its legs do not feel each other.
+
+    Attributes:
+        config: of the robot.
+        joints: names.
+        groups: the legs.
+        base_probe: none, as the trunk is held.
+        on_ground: no.
+        tolerances: of nominal parameters.
+        contact: of its feet where a recording shows it on them; None takes the one that recordings name.
+        free_trunk: no.
+    """
+
+    config: RobotConfig
+    joints: tuple[str, ...] = robot.JOINTS
+    groups: tuple[tuple[int, ...], ...] = LEGS
+    base_probe: tuple[float, ...] = ()
+    on_ground: bool = False
+    tolerances: Tolerances = DECLARED
+    contact: ContactConfig | None = None
+    free_trunk: ClassVar[bool] = False
+
+    @property
+    def top_speed(self) -> tuple[float, ...]:
+        """Speed without load (J,), rad/s."""
+        return tuple(float(v) for v in robot.per_joint(self.config.velocity_limit))
+
+    @property
+    def angle_range(self) -> np.ndarray:
+        """Lowest and highest angle (J, 2), rad."""
+        return robot.JOINT_POS_LIMITS.copy()
+
+    def build(
+        self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False
+    ) -> tuple[Any, ActuatorSetup]:
+        """Return a backend with ``num`` held robots, and their drives."""
+        w, x, y, z = base_quat
+        model, blocks = build_model(self.config, None, physics_dt, held=(w, x, y, z), mounted=mounted)
+        backend = MujocoCpu(model, blocks, num, threads)
+        return backend, actuator_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
+
+    def suited(self, recordings: Sequence[Recording], phase: Phase = "whole") -> Robot:
+        """Return the Go1 on its feet, or its legs in the air, if its trunk is free in a recording, else this one.
+
+        Raises:
+            ConfigError: for one on its feet, if recordings name different contacts and none was chosen.
+        """
+        if not any(r.meta.base == "floating" for r in recordings):
+            return self
+        if phase == "swing":
+            return SwingingGo1(self.config, tolerances=self.tolerances)
+        contact = contact_of(recordings, self.contact)
+        held, known = replace(self, groups=ONE_GROUP), self.tolerances.on(contact)
+        return StandingGo1(self.config, held, tolerances=known, contact=contact)
+
+    def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
+        """Return the recordings as they are."""
+        return Ready(tuple(recordings), settings)
+
+    def windows(self, ready: Ready) -> Windows:
+        """Cut recordings into windows."""
+        return cut(ready.recordings, ready.settings)
+
+    def replayer(self, windows: Windows, quats: np.ndarray, max_rows: int, threads: int) -> Replayer:
+        """Return what replays windows of a held trunk."""
+        return Replayer(self, windows, quats, max_rows, threads)
+
+
+def hung(config: RobotConfig, tolerances: Tolerances = DECLARED, contact: ContactConfig | None = None) -> Robot:
+    """Return a Go1 whose trunk is held; on its feet it has ``contact``, or the one that recordings name."""
+    return HungGo1(config, tolerances=tolerances, contact=contact)

@@ -9,8 +9,8 @@ import numpy as np
 
 from go1exp.gap.data.prepare import Ready
 from go1exp.gap.data.windows import Windows
-from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.replayer import Replayer
+from go1exp.gap.replay.rows import Machine
 from go1exp.gap.result import GapSettings, Phase
 from go1exp.logs.audit import AuditReport
 from go1exp.logs.recording import Recording

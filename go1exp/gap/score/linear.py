@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from go1exp.gap.replay.machine import Machine
-from go1exp.gap.replay.rows import Key, Probe, Theta, variants
+from go1exp.gap.replay.rows import Key, Machine, Probe, Theta, variants
 from go1exp.gap.score.likelihood import Scorer, gram, grouped
 
 

@@ -13,13 +13,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from go1exp.gap.data.splits import Splits, stretches
+from go1exp.gap.data.windows import Splits, stretches
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import DEFAULT_CLOCK, Clock, ClockChoice, GapSettings
 from go1exp.gap.score.angle_errors import of_angles
 from go1exp.gap.score.initial_state import rescaled
-from go1exp.gap.score.likelihood import Scorer
-from go1exp.gap.score.robust import log_chi2
+from go1exp.gap.score.likelihood import Scorer, log_chi2
 from go1exp.gap.search import significance, thresholds
 from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.stepwise import Search

@@ -7,11 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from go1exp.gap.replay.machine import Machine
-from go1exp.gap.replay.rows import Key, Probe, Rows, Theta, null, variants
-from go1exp.gap.score.likelihood import Scorer
+from go1exp.gap.replay.rows import Key, Machine, Probe, Rows, Theta, null, variants
+from go1exp.gap.score.likelihood import Scorer, log_chi2
 from go1exp.gap.score.linear import Layout, Table, corrected, differences
-from go1exp.gap.score.robust import log_chi2
 from go1exp.gap.search import thresholds, tolerances
 from go1exp.sim.effects.tolerances import Tolerances
 

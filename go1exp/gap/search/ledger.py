@@ -8,11 +8,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from go1exp.gap.data.splits import Splits
+from go1exp.gap.data.windows import Splits
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import Candidate, GapSettings
-from go1exp.gap.score.likelihood import Scorer
-from go1exp.gap.score.robust import excess, removed
+from go1exp.gap.score.likelihood import Scorer, excess, removed
 from go1exp.gap.search import significance, thresholds
 from go1exp.gap.search.fit import Model
 from go1exp.gap.search.state import State

@@ -17,8 +17,7 @@ from scipy.optimize import minimize_scalar
 
 from go1exp.gap.replay.rows import Key, Theta, variants
 from go1exp.gap.score.initial_state import FARTHEST, solved
-from go1exp.gap.score.likelihood import Scorer, gram, scorer
-from go1exp.gap.score.robust import log_chi2
+from go1exp.gap.score.likelihood import Scorer, gram, log_chi2, scorer
 from go1exp.gap.search import thresholds
 from go1exp.sim.effects.base import Param
 from go1exp.sim.effects.tolerances import declared

@@ -1,20 +1,174 @@
-"""Fewer and simpler terms: what is not needed is dropped, replaced, or kept to fewer joints."""
+"""Fewer and simpler terms, at the fewest joints that explain them: by joint, part, leg and side."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from scipy.stats import norm
 
 from go1exp.gap.replay.rows import Theta
-from go1exp.gap.score.robust import excess, removed
-from go1exp.gap.search import evidence, places, significance, thresholds, tolerances
-from go1exp.gap.search.last_fit import bootstrapped
+from go1exp.gap.score.likelihood import excess, log_chi2, removed
+from go1exp.gap.score.linear import Layout, predicted
+from go1exp.gap.search import candidates, significance, thresholds, tolerances
+from go1exp.gap.search.certainty import bootstrapped
 from go1exp.gap.search.ledger import Ledger
 from go1exp.gap.search.state import State
 from go1exp.sim.effects.tolerances import sizes
+
+
+def parts(joints: Sequence[str]) -> list[frozenset[int]]:
+    """Return the joints of each part, by their names: all hips (``FR_hip``), all thighs, all calves."""
+    kinds = [name.split("_", 1)[-1] for name in joints]
+    return [frozenset(k for k, kind in enumerate(kinds) if kind == part) for part in dict.fromkeys(kinds)]
+
+
+def pieces(joints: Sequence[str]) -> list[frozenset[int]]:
+    """Return sets of joints that an effect may be at, by their names (``FR_hip``): each one, part, leg, side, and all.
+
+    A side is the legs that share a letter of their two: front, rear, right, left.
+    """
+    names = [name.split("_", 1) if "_" in name else [name, ""] for name in joints]
+    legs = list(dict.fromkeys(leg for leg, _ in names))
+    sets = [*(frozenset([k]) for k in range(len(joints))), *parts(joints)]
+    sets += [frozenset(k for k, name in enumerate(names) if name[0] == leg) for leg in legs]
+    if len(legs) == 4 and all(len(leg) == 2 for leg in legs):
+        for letter in (0, 1):
+            values = dict.fromkeys(leg[letter] for leg in legs)
+            sets += [frozenset(k for k, (leg, _) in enumerate(names) if leg[letter] == value) for value in values]
+    return list(dict.fromkeys([*sets, frozenset(range(len(joints)))]))
+
+
+class Linear:
+    """The linear model of a settled state, on the windows of the fit and on those that no fit has seen."""
+
+    def __init__(self, state: State) -> None:
+        """Take it as it is known on the windows of the fit; on held-out ones it is measured where it is asked for."""
+        scorer, self.train, self.may = state.scorer, state.table, state.may
+        self.machine, self.theta = state.machine, state.theta
+        self.layout = Layout.from_probes(self.machine, self.train.probes)
+        chi2 = scorer.chi2(self.train.residual, self.train.windows)
+        grams = self.train.grams(scorer) / np.maximum(chi2, 1.0)[..., None, None]
+        self.matrix, self.right = self.layout.total(grams)
+        self._state = state
+
+    @cached_property
+    def _held(self) -> tuple[np.ndarray, np.ndarray]:
+        """Gram matrices and sizes of held-out windows: measured when first asked for, which is seldom."""
+        state = self._state
+        held = state.linear(state.theta, state.splits.select)
+        return held.grams(state.scorer), state.scorer.size[held.windows][:, None]
+
+    def _solved(self, kept: frozenset[tuple[str, int]]) -> tuple[np.ndarray, tolerances.Bounds]:
+        may = replace(self.may, kept=kept)
+        limits = tolerances.bounds(self.layout, self.train.probes, self.train.theta, may, back=True)
+        return tolerances.solve(self.matrix, self.right, limits), limits
+
+    def price(self, kept: frozenset[tuple[str, int]]) -> float:
+        """Return how small chi2 and priors can be on the windows of the fit if effects stay in tolerance at joints."""
+        return tolerances.price(self.matrix, self.right, self._solved(kept)[1])
+
+    def held_out(self, kept: frozenset[tuple[str, int]]) -> np.ndarray:
+        """Return log chi2 (V, G) on held-out windows, fitted on the others so."""
+        held, size = self._held
+        after = np.maximum(predicted(held, self.layout, self._solved(kept)[0]), 0.0)
+        return log_chi2(after / size)
+
+
+def chosen(linear: Linear, name: str, kept: frozenset[tuple[str, int]], rng: np.random.Generator) -> frozenset[int]:
+    """Return the joints at which a term leaves its tolerance for a reason.
+
+    Sets of joints are added as long as each joint pays for itself; then joints are taken away that bring too little, or
+    that held-out windows do not miss.
+
+    Args:
+        linear: of the model with the term.
+        name: of the term.
+        kept: effects and joints that stay within tolerance already.
+        rng: of the tests.
+    """
+    joints, known = linear.machine.joints, linear.may.tolerances
+    outside = frozenset(int(j) for j in np.flatnonzero(candidates.beyond(name, linear.theta, joints, known)))
+    if len(outside) < 2 or tolerances.identification(name).common:  # what shares a value is where it was found
+        return outside
+    prices: dict[frozenset[int], float] = {}
+
+    def without(inside: frozenset[int]) -> frozenset[tuple[str, int]]:
+        return kept | {(name, j) for j in outside - inside}
+
+    def price(inside: frozenset[int]) -> float:
+        if inside not in prices:
+            prices[inside] = linear.price(without(inside))
+        return prices[inside]
+
+    sets = [piece & outside for piece in pieces(joints) if piece & outside]
+    inside = frozenset[int]()
+    while inside != outside:
+        larger = min(
+            (inside | piece for piece in sets),
+            key=lambda joints_of: price(joints_of) + thresholds.JOINT_GAIN * len(joints_of),
+        )
+        if price(larger) + thresholds.JOINT_GAIN * len(larger) >= price(inside) + thresholds.JOINT_GAIN * len(inside):
+            break
+        inside = larger
+    brings = {j: price(inside - {j}) - price(inside) for j in inside}
+    for j in sorted(brings, key=lambda j: brings[j]):
+        relief = price(inside - {j}) - price(inside)
+        if len(inside) > 1 and (
+            relief < thresholds.JOINT_GAIN or _unmissed(linear, j, relief, brings, without, inside, rng)
+        ):
+            inside -= {j}
+    return inside or frozenset([max(outside, key=lambda j: price(outside - {j}))])
+
+
+def fewer(linear: Linear, name: str, kept: frozenset[tuple[str, int]]) -> list[frozenset[int]]:
+    """Return smaller sets of joints that a term might be at alone, to be fitted: the fewest joints first.
+
+    About values that are spread over joints the linear model cannot tell what one of them would do alone: a thigh of
+    0.74 of its mass was 0.83, with two hips of 1.8 and 1.4. Left out are sets that lose most of what the term brings.
+
+    Args:
+        linear: of the model with the term.
+        name: of the term.
+        kept: effects and joints that stay within tolerance already.
+    """
+    joints, known = linear.machine.joints, linear.may.tolerances
+    outside = frozenset(int(j) for j in np.flatnonzero(candidates.beyond(name, linear.theta, joints, known)))
+    if len(outside) < 2 or tolerances.identification(name).common:
+        return []
+
+    def price(inside: frozenset[int]) -> float:
+        return linear.price(kept | {(name, j) for j in outside - inside})
+
+    least, most = price(outside), price(frozenset())
+    smaller = {piece & outside for piece in pieces(joints)} - {outside, frozenset()}
+    left = {piece: (price(piece) - least) / max(most - least, 1e-9) for piece in smaller}
+    best: dict[int, frozenset[int]] = {}
+    for piece in sorted((p for p in left if left[p] < thresholds.LOST_SHARE), key=lambda p: left[p]):
+        best.setdefault(len(piece), piece)
+    return [best[size] for size in sorted(best)]
+
+
+def _unmissed(
+    linear: Linear,
+    joint: int,
+    relief: float,
+    brings: Mapping[int, float],
+    without: Callable[[frozenset[int]], frozenset[tuple[str, int]]],
+    inside: frozenset[int],
+    rng: np.random.Generator,
+) -> bool:
+    """Return whether held-out windows do as well without a joint that brings little beside the others."""
+    if relief >= thresholds.PLAIN_SHARE * max(brings.values()):
+        return False
+    group = next(g for g, members in enumerate(linear.machine.groups) if joint in members)
+    gain = linear.held_out(without(inside - {joint})) - linear.held_out(without(inside))
+    return bool(
+        gain[:, group].mean() <= 0.0 or significance.max_t(gain[None, :, group], rng)[0] > thresholds.DOUBTFUL_P
+    )
 
 
 def eliminate(search: Ledger) -> None:
@@ -43,22 +197,22 @@ def simplify(search: Ledger) -> None:
         rest = instead_of(search.state, name).settled(2)
         before, after = search.state.held_out(search.nominal), search.state.held_out()
         gain, less = significance.gains(before, np.stack([after, rest.held_out()])).mean(axis=1)
-        large = evidence.size(simpler, rest.theta, rest.tolerances) > 1.0
+        large = candidates.size(simpler, rest.theta, rest.tolerances) > 1.0
         joints, known = rest.machine.joints, rest.tolerances
-        strains = evidence.bounded(simpler, rest.theta, joints, known).any()
-        strained = evidence.bounded(name, search.state.theta, joints, known).any()
+        strains = candidates.bounded(simpler, rest.theta, joints, known).any()
+        strained = candidates.bounded(name, search.state.theta, joints, known).any()
         # What would go beyond its bound is a worse name than what need not: a hip of twice its mass, for a load.
         if less > gain - significance.same(gain) and large and (strained or not strains):
             replaced(search, name, simpler, rest, still_equal(search, name, simpler, rest))
 
 
 def prune(search: Ledger) -> None:
-    """Bring back within tolerance what leaves it at a joint for too little (``gap/search/places.py``)."""
-    linear, kept = places.Linear(search.state), search.state.kept
+    """Bring back within tolerance what leaves it at a joint for too little (``gap/search/reduction.py``)."""
+    linear, kept = Linear(search.state), search.state.kept
     for name in search.state.terms:
         theta, joints = search.state.theta, search.state.machine.joints
-        outside = np.flatnonzero(evidence.beyond(name, theta, joints, search.state.tolerances))
-        inside = places.chosen(linear, name, kept, search.rng)
+        outside = np.flatnonzero(candidates.beyond(name, theta, joints, search.state.tolerances))
+        inside = chosen(linear, name, kept, search.rng)
         kept |= {(name, int(j)) for j in outside if j not in inside}
     if kept != search.state.kept:
         keep_within(search, kept)
@@ -68,9 +222,9 @@ def prune(search: Ledger) -> None:
 
 def concentrate(search: Ledger, name: str) -> None:
     """Keep a term to the fewest joints with which, all else fitted again, held-out windows are no worse."""
-    linear, joints = places.Linear(search.state), search.state.machine.joints
-    outside = np.flatnonzero(evidence.beyond(name, search.state.theta, joints, search.state.tolerances))
-    for inside in places.fewer(linear, name, search.state.kept):
+    linear, joints = Linear(search.state), search.state.machine.joints
+    outside = np.flatnonzero(candidates.beyond(name, search.state.theta, joints, search.state.tolerances))
+    for inside in fewer(linear, name, search.state.kept):
         others = frozenset((name, int(j)) for j in outside if j not in inside)
         sparse = search.state.keeping(search.state.kept | others).settled(3, rival=search.state)
         chi2 = sparse.held_out()
@@ -106,14 +260,14 @@ def symmetrical(search: Ledger) -> None:
             continue
         first, second = ((name, parameter) for parameter in how.simpler_if_equal)
         theta, joints = search.state.theta, search.state.machine.joints
-        outside = evidence.beyond(name, theta, joints, search.state.tolerances)
+        outside = candidates.beyond(name, theta, joints, search.state.tolerances)
         differences = np.stack([draw[first] - draw[second] for draw in resampled(search)])
         # 95 % for all joints together: of twelve intervals of 95 % one would often miss zero by chance.
         wide = norm.ppf(1.0 - 0.025 / max(int(outside.sum()), 1)) * differences.std(axis=0)
         if not np.all((np.abs(differences.mean(axis=0)) <= wide)[outside]):
             continue
         rest = instead_of(search.state, name).settled(2)
-        if evidence.size(how.simpler, rest.theta, rest.tolerances) > 1.0:
+        if candidates.size(how.simpler, rest.theta, rest.tolerances) > 1.0:
             replaced(search, name, how.simpler, rest, still_equal(search, name, how.simpler, rest))
 
 
@@ -128,7 +282,7 @@ def still_equal(search: Ledger, name: str, instead: str, rest: State) -> tuple[s
     fitted = [search.state.without(name, other).settled(2) for other in others]
     held_out = np.stack([rest.held_out(), *(state.held_out() for state in fitted)])
     equal = significance.equals(significance.gains(search.state.held_out(search.nominal), held_out), 0, search.rng)
-    large = [evidence.size(n, s.theta, s.tolerances) > 1.0 for n, s in zip(others, fitted, strict=True)]
+    large = [candidates.size(n, s.theta, s.tolerances) > 1.0 for n, s in zip(others, fitted, strict=True)]
     return tuple(n for n, e, out in zip(others, equal[1:], large, strict=True) if e and out)
 
 
@@ -178,7 +332,7 @@ def unite(search: Ledger) -> None:
         gain, less = significance.gains(before, np.stack([search.select_chi2, chi2])).mean(axis=1)
         as_well = less > gain - significance.same(gain)
         as_well &= excess(chi2) <= excess(search.select_chi2) + thresholds.SAME_GAIN
-        if as_well and evidence.size(model.name, rest.theta, rest.tolerances) > 1.0:
+        if as_well and candidates.size(model.name, rest.theta, rest.tolerances) > 1.0:
             search.reject(several, f"{model.name} alone does as well")
             replaced(search, several[0], model.name, rest)
             return

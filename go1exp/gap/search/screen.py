@@ -10,12 +10,10 @@ from itertools import product
 import numpy as np
 
 from go1exp.gap.data.windows import Windows
-from go1exp.gap.replay.machine import Machine
-from go1exp.gap.replay.rows import Key, Probe, Theta, variants
-from go1exp.gap.score.likelihood import Scorer
+from go1exp.gap.replay.rows import Key, Machine, Probe, Theta, variants
+from go1exp.gap.score.likelihood import Scorer, log_chi2
 from go1exp.gap.score.linear import Layout, Table, differences, predicted
-from go1exp.gap.score.robust import log_chi2
-from go1exp.gap.search import strain, thresholds, tolerances
+from go1exp.gap.search import thresholds, tolerances
 from go1exp.sim.effects.identification import Identification, Periodic
 from go1exp.sim.effects.tolerances import Tolerances, sizes
 
@@ -228,7 +226,7 @@ class _Ranking:
         self.size = scorer.size[present.windows][:, None]
         self.grams = full.grams(scorer)
         self.before = self.grams[..., -1, -1] / self.size
-        self.plain, self.count = strain.cost(scorer, present)(may), strain.values(scorer, present)
+        self.plain, self.count = tolerances.cost(scorer, present)(may), tolerances.values(scorer, present)
 
     def screened(self, variant: Variant, at: int) -> Screened:
         """Judge a variant whose probes begin at column ``at``."""
@@ -247,7 +245,7 @@ class _Ranking:
             for i in layout.part(np.arange(known, len(probes))):
                 delta, joint = probes[layout.probe[i]].delta, int(layout.joint[i])
                 limits.low[i] = limits.high[i] = delta[joint if joint >= 0 else int(np.argmax(np.abs(delta)))]
-        relief = (self.plain - strain.price(matrix, right, strict)) / self.count
+        relief = (self.plain - tolerances.price(matrix, right, strict)) / self.count
         x = tolerances.solve(matrix, right, limits)
         after = np.maximum(predicted(part, layout, x), 0.0) / self.size  # rounding can make it negative
         gain = float(np.mean(log_chi2(self.before) - log_chi2(after)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from go1exp.gap.result import GapSettings
-from go1exp.gap.score.robust import log_chi2
+from go1exp.gap.score.likelihood import log_chi2
 from go1exp.gap.search import thresholds
 
 

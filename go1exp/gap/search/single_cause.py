@@ -1,13 +1,10 @@
-"""One effect of the whole robot against a hundred tolerances: what a robot on its feet hides from the stepwise search.
+"""One effect of the whole robot against a hundred tolerances, for a robot that stands.
 
-A payload makes every leg bear more; so does every drive that is a little weak, each within its tolerance. On the ground
-the tolerances of twelve joints together imitate any effect on the trunk up to several times its own tolerance, so a
-search that lets them move first finds no gap. An effect of the whole robot has a few numbers, and so has one that is
-alike at all joints, such as drives on a low battery. If one of them alone, all else at its nominal value, removes
-nearly all of the error, and no other does as well, then it is the explanation, not a hundred numbers that happen to
-agree. One of the joints must also do better than all that it, drives and legs may be off alike within their tolerances,
-and stay alike where each joint is fitted by itself: what is wrong in two ways takes other values at each. How well a
-recording tells each of them is counted (``alike.py``).
+On the ground the tolerances of twelve joints together imitate an effect on the trunk up to several times its own
+tolerance. So an effect with a few numbers, of the trunk or shared by all joints, is fitted alone first, all else at its
+nominal value. It is the explanation if it removes nearly all of the error and no other effect does as well. An effect
+of the joints must also do better than tolerances that all joints share, and stay shared where each joint is fitted by
+itself, within the standard errors of the estimates.
 """
 
 from __future__ import annotations
@@ -19,13 +16,56 @@ import numpy as np
 
 from go1exp.config.schema.registry import members
 from go1exp.gap.replay.rows import Theta
-from go1exp.gap.score.likelihood import Scorer
+from go1exp.gap.score.likelihood import Scorer, excess, log_chi2, removed
 from go1exp.gap.score.linear import table
-from go1exp.gap.score.robust import excess, log_chi2, removed
-from go1exp.gap.search import alike, places, profile_likelihood, significance, thresholds, tolerances
+from go1exp.gap.search import profile_likelihood, reduction, significance, thresholds, tolerances
+from go1exp.gap.search.certainty import bootstrapped
 from go1exp.gap.search.fit import Model, fit, scores
 from go1exp.gap.search.state import State
 from go1exp.sim.effects.tolerances import effect_class, sizes
+
+
+def differ(values: np.ndarray, drawn: np.ndarray, tolerance: float) -> bool:
+    """Return whether some of the values differ by more than a tolerance beyond doubt.
+
+    If none of them truly does, two estimates differ by at most the tolerance and the difference of their errors. So the
+    largest of all pairs, each in its own standard errors, is compared with the largest that errors alone make.
+
+    Args:
+        values: (J,) estimates.
+        drawn: (B, J) the same by resamples.
+        tolerance: by which they may truly differ.
+    """
+    one, other = np.triu_indices(len(values), 1)
+    beyond = np.abs(values[one] - values[other]) - tolerance
+    if not (beyond > 0.0).any():
+        return False
+    errors = drawn - drawn.mean(axis=0)
+    apart = np.abs(errors[:, one] - errors[:, other])
+    scale = np.sqrt((apart**2).mean(axis=0)) + 1e-9 * tolerance
+    return bool((beyond / scale).max() > np.quantile((apart / scale).max(axis=1), 1.0 - thresholds.SHARED_LEVEL))
+
+
+def may_be(model: Model, state: State) -> bool:
+    """Return whether each parameter of a cause may be the same at all joints, to one tolerance.
+
+    Args:
+        model: fitted joint by joint.
+        state: whose initial states suit it.
+    """
+    known = model.may.tolerances
+    parameters = [key for key in model.keys if key in model.theta and model.theta[key].size > 1]
+    if all(np.ptp(model.theta[key]) <= known.param(key).tolerance for key in parameters):
+        return True
+    state = replace(state, terms=(model.name,), theta=model.theta)
+    windows, probes = state.splits.train, tolerances.probes(state.machine, model.keys, model.theta)
+    linear = table(state.scorer, model.theta, windows, probes, state.dt)
+    chi2, rng = state.scorer.chi2(linear.residual, windows), np.random.default_rng(state.settings.seed)
+    draws = list(bootstrapped(state, linear, chi2, rng, thresholds.SHARED_DRAWS, nominal=False))
+    return not any(
+        differ(model.theta[key], np.stack([draw[key] for draw in draws]), known.param(key).tolerance)
+        for key in parameters
+    )
 
 
 def stretched(scorer: Scorer, model: Model, windows: np.ndarray, dt: float) -> Model:
@@ -121,7 +161,7 @@ def _off_alike(begun: Scorer, best: Theta, windows: np.ndarray, dt: float) -> Th
     everywhere = profile_likelihood.within_tolerances(begun, best, keys, windows, dt)
     of_drives = [key for name in effects if not effect_class(name).fields for key in sizes(name)]
     joints = begun.windows.joints
-    return profile_likelihood.at_one_part(begun, everywhere, of_drives, places.parts(joints), windows, dt)
+    return profile_likelihood.at_one_part(begun, everywhere, of_drives, reduction.parts(joints), windows, dt)
 
 
 Judge = Callable[[Sequence[Model], State, np.ndarray, np.ndarray], tuple[Model | None, Model | None]]
@@ -169,7 +209,7 @@ def _confirmed(best: Model, state: State, judged: Judge, plain: np.ndarray, now:
     for _ in range(thresholds.CAUSE_TURNS):
         state = replace(state, theta=best.theta).renewed()
         best = refitted(state.scorer, best, state.splits.train, state.dt)
-    if not alike.may_be(best, state):
+    if not may_be(best, state):
         return None
     share = removed(excess(now), excess(state.held_out(best.theta)))
     accepted, _ = judged([best], state, plain, now)

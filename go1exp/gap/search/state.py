@@ -7,13 +7,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from go1exp.gap.data.splits import Splits
-from go1exp.gap.replay.machine import Machine
-from go1exp.gap.replay.rows import Key, Theta
+from go1exp.gap.data.windows import Splits
+from go1exp.gap.replay.rows import Key, Machine, Theta
 from go1exp.gap.result import GapSettings
-from go1exp.gap.score.likelihood import Scorer
+from go1exp.gap.score.likelihood import Scorer, log_chi2
 from go1exp.gap.score.linear import Table, borrowed, table
-from go1exp.gap.score.robust import log_chi2
 from go1exp.gap.search import thresholds, tolerances
 from go1exp.gap.search.fit import Model, descend, scores
 from go1exp.gap.search.screen import free_shapes

@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from go1exp.gap.replay.rows import Theta
-from go1exp.gap.score.robust import excess
-from go1exp.gap.search import evidence, reduction, significance, single_cause, strain, thresholds, tolerances
+from go1exp.gap.score.likelihood import excess
+from go1exp.gap.search import candidates, reduction, significance, single_cause, thresholds, tolerances
+from go1exp.gap.search.candidates import Trial, tried
 from go1exp.gap.search.fit import Model, fit, misfit
 from go1exp.gap.search.ledger import Ledger
 from go1exp.gap.search.screen import Screened, library, motion, outside, rivals, screen
 from go1exp.gap.search.state import State
-from go1exp.gap.search.trial import Trial, tried
 from go1exp.sim.effects.tolerances import sizes
 
 
@@ -44,7 +44,7 @@ class Search(Ledger):
             reduction.simplify(self)
             reduction.prune(self)
             reduction.symmetrical(self)
-        sizes_of_terms = [evidence.size(t, self.state.theta, self.state.tolerances) for t in self.state.terms]
+        sizes_of_terms = [candidates.size(t, self.state.theta, self.state.tolerances) for t in self.state.terms]
         if self.strained and sizes_of_terms and max(sizes_of_terms) <= thresholds.CLEARLY_BEYOND:
             self.withdraw("it leaves its tolerance by too little to be called missing")
 
@@ -106,9 +106,9 @@ class Search(Ledger):
             screened: what screening says of every effect; it is asked if that is nothing, and needed.
         """
         within = tolerances.nominal(self.state.machine)
-        relief = strain.relief(self.state.scorer, self.state.table, self.state.may)
-        values = strain.values(self.state.scorer, self.state.table)
-        straining = strain.straining(relief, values, [*self.state.terms, *self._unasked()])
+        relief = tolerances.relief(self.state.scorer, self.state.table, self.state.may)
+        values = tolerances.values(self.state.scorer, self.state.table)
+        straining = tolerances.straining(relief, values, [*self.state.terms, *self._unasked()])
         missing = outside(screened, within)
         if not straining and not missing:
             self._note_absorbed(relief)
@@ -190,7 +190,7 @@ class Search(Ledger):
         """Note which effects of the tolerance box the data would rather have outside it."""
         if not self.state.terms:  # beside a term they are no rivals of it
             state, most = self.state, self.settings.shortlist
-            self.candidates += evidence.absorbed(state.keys, relief, state.theta, state.tolerances, most)
+            self.candidates += candidates.absorbed(state.keys, relief, state.theta, state.tolerances, most)
 
     def _unasked(self) -> list[str]:
         """Return the effects that the user does not want to be considered."""
@@ -300,7 +300,7 @@ class Search(Ledger):
         for k in np.argsort(-trial.mean):
             status, reason = trial.reason(int(k))
             self.candidates.append(
-                evidence.candidate(
+                candidates.candidate(
                     fitted[k],
                     self.scorer.windows.joints,
                     excess_after=trial.after[k],

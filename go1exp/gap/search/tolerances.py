@@ -1,4 +1,4 @@
-"""The nominal model within its tolerances: which parameters may move, how far, and where they fit best.
+"""The nominal model within its tolerances: which parameters may move, how far, and which bounds are active.
 
 An effect counts as a gap only where the data ask for more of it than its declared tolerance, so everything that a model
 has or obviously could have moves freely inside.
@@ -7,15 +7,15 @@ has or obviously could have moves freely inside.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from go1exp.config.schema.registry import members
-from go1exp.gap.replay.machine import Machine
-from go1exp.gap.replay.rows import Key, Probe, Theta
-from go1exp.gap.score.linear import Layout
+from go1exp.gap.replay.rows import Key, Machine, Probe, Theta
+from go1exp.gap.score.likelihood import Scorer
+from go1exp.gap.score.linear import Layout, Table
 from go1exp.gap.search import thresholds
 from go1exp.sim.effects.base import Param
 from go1exp.sim.effects.identification import Identification
@@ -246,3 +246,50 @@ def without(theta: Theta, name: str, tolerances: Tolerances) -> Theta:
             value = value.clip(p.null - p.tolerance, p.null + p.tolerance)
         values[key] = value
     return values
+
+
+def values(scorer: Scorer, linear: Table) -> float:
+    """Return how many values are compared in the windows of ``own``."""
+    return float(scorer.size[linear.windows].sum()) * len(scorer.replayer.machine.groups)
+
+
+def cost(scorer: Scorer, linear: Table) -> Callable[[Freedom], float]:
+    """Return a function that says how small chi2 and priors can be, to first order about ``own``, with some freedom."""
+    layout = Layout.from_probes(scorer.replayer.machine, linear.probes)
+    chi2 = scorer.chi2(linear.residual, linear.windows)
+    matrix, right = layout.total(linear.grams(scorer) / np.maximum(chi2, 1.0)[..., None, None])
+
+    def smallest(may: Freedom) -> float:
+        limits = bounds(layout, linear.probes, linear.theta, may, back=True)
+        return price(matrix, right, limits)
+
+    return smallest
+
+
+def price(matrix: np.ndarray, right: np.ndarray, limits: Bounds) -> float:
+    """Return the bounded minimum that :func:`go1exp.gap.search.tolerances.solve` reaches."""
+    x = solve(matrix, right, limits)
+    return float(x @ matrix @ x - 2.0 * right @ x + (limits.weight * (x - limits.centre) ** 2).sum())
+
+
+def relief(scorer: Scorer, linear: Table, may: Freedom) -> dict[str, float]:
+    """Return by how much chi2 and priors would fall if an effect might leave its tolerance."""
+    effects = dict.fromkeys(p.key[0] for p in linear.probes)
+    smallest = cost(scorer, linear)
+    return {effect: smallest(may) - smallest(may.also(effect)) for effect in effects}
+
+
+def straining(relieved: Mapping[str, float], count: float, but: Collection[str]) -> list[str]:
+    """Return the effects that would leave their tolerance if they might, the one that gains most first.
+
+    Args:
+        relieved: what :func:`relief` found.
+        count: of values that were compared.
+        but: effects that are out of the question.
+    """
+    order = sorted((e for e in relieved if e not in but), key=lambda e: -relieved[e])
+    return [
+        e
+        for e in order[: thresholds.MOST_ACTIVE_BOUNDS]
+        if relieved[e] > max(thresholds.ACTIVE_BOUND * count, relieved[order[0]] / thresholds.RIVAL_RATIO)
+    ]

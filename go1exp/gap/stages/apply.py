@@ -18,15 +18,14 @@ from go1exp.config.schema.joint_values import spread
 from go1exp.config.schema.physics import contact_text
 from go1exp.config.schema.registry import Term, members
 from go1exp.gap.comparison import Comparison, compare, robot_from
-from go1exp.gap.data.contact import tolerances_of
-from go1exp.gap.data.fingerprint import fingerprint
+from go1exp.gap.data.prepare import fingerprint, tolerances_of
 from go1exp.gap.files import CALIBRATION, COMPENSATING, EFFECT, GapFileError
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
 from go1exp.gap.robots.fixed_base import FixedBase
-from go1exp.gap.robots.hung import HungGo1
+from go1exp.gap.robots.go1 import HungGo1
 from go1exp.gap.robots.protocol import Robot
-from go1exp.gap.score.robust import excess, removed
+from go1exp.gap.score.likelihood import excess, removed
 from go1exp.gap.search.fit import scores
 from go1exp.logs.recording import Recording
 from go1exp.robot.config import RobotConfig

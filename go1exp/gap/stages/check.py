@@ -12,8 +12,8 @@ from go1exp.gap.answer import can_stand, not_excited
 from go1exp.gap.comparison import NotComparable, Progress, compare, robot_from
 from go1exp.gap.result import EXIT_CODES, Floors, GapSettings, Localisation
 from go1exp.gap.robots.protocol import Robot
-from go1exp.gap.score.localise import localise
-from go1exp.gap.score.robust import excess
+from go1exp.gap.score.angle_errors import localise
+from go1exp.gap.score.likelihood import excess
 from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.stepwise import Search
 from go1exp.logs.recording import Recording

@@ -14,14 +14,12 @@ from go1exp import __version__
 from go1exp.base.tensors.threads import one_thread
 from go1exp.gap.answer import Answer, can_stand, concluded, evidence, not_excited
 from go1exp.gap.comparison import FEWEST_WINDOWS, Comparison, NotComparable, Progress, compare, robot_from
-from go1exp.gap.data.fingerprint import fingerprint
+from go1exp.gap.data.prepare import fingerprint
 from go1exp.gap.replay.rows import Theta, variants
 from go1exp.gap.result import AngleErrors, GapResult, GapSettings, NamedEffect, Overlay
 from go1exp.gap.robots.protocol import Robot
-from go1exp.gap.score.angle_errors import angle_errors
-from go1exp.gap.score.likelihood import Scorer
-from go1exp.gap.score.localise import localise
-from go1exp.gap.score.robust import excess
+from go1exp.gap.score.angle_errors import angle_errors, localise
+from go1exp.gap.score.likelihood import Scorer, excess
 from go1exp.gap.search import clocks
 from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.stepwise import Search

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from go1exp.gap.comparison import Progress
-from go1exp.gap.design.limits import DesignError
+from go1exp.gap.design.plan import DesignError
 from go1exp.gap.design.settings import DesignSettings
 from go1exp.gap.result import GapResult, GapSettings
 from go1exp.gap.robots.protocol import Robot

@@ -12,11 +12,9 @@ import numpy as np
 
 from go1exp.base.tensors.threads import one_thread
 from go1exp.gap.comparison import Comparison, Progress, compare, robot_from
-from go1exp.gap.data.fingerprint import fingerprint
-from go1exp.gap.design.choice import COARSE, ENOUGH, Choice, choose
-from go1exp.gap.design.limits import DesignError, limits_of
-from go1exp.gap.design.plan import Attitude
-from go1exp.gap.design.power import Judge, Pair, Worth
+from go1exp.gap.data.prepare import fingerprint
+from go1exp.gap.design.choice import COARSE, ENOUGH, Choice, Judge, Pair, Worth, choose
+from go1exp.gap.design.plan import Attitude, DesignError, limits_of
 from go1exp.gap.design.rehearsal import Rehearsal, Stage
 from go1exp.gap.design.settings import DesignSettings
 from go1exp.gap.replay.rows import Theta

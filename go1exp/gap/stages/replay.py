@@ -22,8 +22,7 @@ from go1exp.gap.replay.rows import Rows, variants
 from go1exp.gap.result import EXIT_CODES, GapSettings
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score.initial_state import solved
-from go1exp.gap.score.likelihood import Scorer
-from go1exp.gap.score.robust import excess
+from go1exp.gap.score.likelihood import Scorer, excess
 from go1exp.gap.search.fit import residuals
 from go1exp.logs.recording import VECTORS, Recording, joint_channels
 from go1exp.robot.config import RobotConfig
