@@ -14,7 +14,7 @@ from go1exp.gap.answer import Answer, bounded_joints, weak_joints
 from go1exp.gap.result import Candidate, GapSettings, NamedEffect
 from go1exp.gap.search.candidates import Trial
 from go1exp.gap.search.certainty import beside_a_gap, doubt, widened
-from go1exp.gap.search.ledger import LastCheck, Ledger
+from go1exp.gap.search.search import LastCheck, Search
 from go1exp.gap.sentence import sentence
 from go1exp.sim.effects.tolerances import DECLARED, declared
 
@@ -105,9 +105,9 @@ def test_a_term_is_judged_by_what_it_took_itself_not_by_what_all_took(own: float
 def test_beside_a_large_effect_a_small_one_is_judged_by_what_is_left_without_it(
     returned: float, left: float, share: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("go1exp.gap.search.ledger.excess", lambda chi2: chi2)
+    monkeypatch.setattr("go1exp.gap.search.search.excess", lambda chi2: chi2)
     search: Any = SimpleNamespace(first=100.0, select_chi2=left, share_of=lambda term: returned)
-    assert Ledger.removes(search, "torque_delay") == pytest.approx(share, nan_ok=True)
+    assert Search.removes(search, "torque_delay") == pytest.approx(share, nan_ok=True)
 
 
 @pytest.mark.parametrize(
@@ -176,7 +176,7 @@ def test_where_another_does_as_well_and_a_gap_remains_neither_is_certain() -> No
 
 
 def test_what_the_last_check_does_not_bear_out_is_not_certain() -> None:
-    assert "does not bear it out" in why(Stub(), check=LastCheck(False, -0.2), adequate=True)
+    assert "does not confirm it" in why(Stub(), check=LastCheck(False, -0.2), adequate=True)
     assert "only 30% of the excess goes" in why(Stub(), check=LastCheck(True, 0.3), adequate=True)
     assert why(Stub(), check=LastCheck(True, math.nan), adequate=True) == ""  # there was no gap on it
 

@@ -32,7 +32,8 @@ from go1exp.gap.robots.go1 import HungGo1, StandingGo1
 from go1exp.gap.score.initial_state import settled
 from go1exp.gap.search import profile_likelihood, tolerances
 from go1exp.gap.search.screen import Motion, library
-from go1exp.gap.search.stepwise import Search
+from go1exp.gap.search.search import Search, begun
+from go1exp.gap.search.stepwise import alone
 from go1exp.gap.stages import apply
 from go1exp.gap.stages.explain import explain
 from go1exp.logs.record.simulate import policy_task
@@ -238,7 +239,7 @@ def search_in(recordings: tuple[Recording, ...], config: RobotConfig, contact: C
     score, _ = settled(replayer, 0.001, 0.00015)
     rng = np.random.default_rng(0)
     parts = splits([r.meta for r in recordings], score.windows.episode, 0.2, rng)
-    return Search(score, parts, QUICK, 0.001, rng, lambda what, share: None)
+    return begun(score, parts, QUICK, 0.001, rng)
 
 
 def test_a_hard_floor_is_the_models_own_where_recordings_name_it_and_else_off() -> None:
@@ -248,18 +249,19 @@ def test_a_hard_floor_is_the_models_own_where_recordings_name_it_and_else_off() 
     right, wrong = (np.log(s.state.held_out({})).mean() for s in (own, other))
     assert right < 0.3
     assert wrong > right + 1.0
-    assert own.single_cause() is None
-    assert own.candidates == []
+    own, cause = alone(own)
+    assert cause is None
+    assert own.candidates == ()
 
 
 @pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 def test_a_payload_on_a_hard_floor_is_named_by_the_models_own_contact_alone() -> None:
     config, recordings = recorded("excitation=[squat,drop]", "contact=stiff", "seeds=[0,1]", "+effect.payload.mass=1.0")
-    cause = search_in(recordings, config, None).single_cause()
+    _, cause = alone(search_in(recordings, config, None))
     assert cause is not None
     assert cause.name == "payload"
     assert cause.theta["payload", "mass"].item() == pytest.approx(1.0, abs=0.1)
-    assert search_in(recordings, config, MUJOCO_CONTACT).single_cause() is None
+    assert alone(search_in(recordings, config, MUJOCO_CONTACT))[1] is None
 
 
 # ---------------------------------------------------------------------- answers

@@ -17,8 +17,8 @@ from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import Table, unbiased_grams
 from go1exp.gap.search import thresholds
 from go1exp.gap.search.certainty import opposite, resampled_values, semidefinite
+from go1exp.gap.search.search import begun
 from go1exp.gap.search.state import State
-from go1exp.gap.search.stepwise import Search
 from go1exp.sim.effects.tolerances import DECLARED
 from go1exp.sim.task import parse_parts
 from tests.laboratory import recorded
@@ -37,11 +37,11 @@ def delays(monkeypatch: pytest.MonkeyPatch, finer: int) -> tuple[np.ndarray, np.
     rng = np.random.default_rng(0)
     comparison = compare(list(logs), robot_from(config), QUICK)
     parts = comparison.split(rng)
-    search = Search(comparison.scorer, parts, comparison.settings, comparison.dt, rng, lambda what, share: None)
+    search = begun(comparison.scorer, parts, comparison.settings, comparison.dt, rng)
     key = ("command_delay", "delay")
     theta: Theta = {key: np.full(12, HIDDEN_S)}
-    search.state = replace(search.state, terms=("command_delay",), theta=theta).settled(1)
-    fitted, drawn = resampled_values(search)
+    state = replace(search.state, terms=("command_delay",), theta=theta).settled(1)
+    fitted, drawn = resampled_values(replace(search, state=state))
     return fitted[key], drawn[key]
 
 

@@ -32,7 +32,7 @@ from go1exp.gap.robots.go1 import HungGo1
 from go1exp.gap.search import tolerances
 from go1exp.gap.search.certainty import resampled_values
 from go1exp.gap.search.ledger import LastCheck
-from go1exp.gap.search.stepwise import Search
+from go1exp.gap.search.search import begun
 from go1exp.gap.stages.explain import explain
 from go1exp.logs.importers import import_recordings
 from go1exp.logs.recording import Meta, Recording, joint_channel
@@ -418,10 +418,11 @@ def test_a_value_that_is_held_has_no_interval() -> None:
     logs = [dataclasses.replace(r, meta=dataclasses.replace(r.meta, episode=f"e{n}")) for n, r in enumerate(logs)]
     rng = np.random.default_rng(0)
     found = compare(logs, robot, QUICK)
-    search = Search(found.scorer, found.split(rng), found.settings, found.dt, rng, lambda what, share: None)
+    search = begun(found.scorer, found.split(rng), found.settings, found.dt, rng)
     theta: Theta = {("load_friction", name): np.array([value]) for name, value in hidden.items()}
-    search.state = dataclasses.replace(search.state, terms=("load_friction",), theta=theta).settled(1)
-    search.aliases, search.select_chi2 = {"load_friction": ("load_friction",)}, search.state.held_out()
+    state = dataclasses.replace(search.state, terms=("load_friction",), theta=theta).settled(1)
+    aliases = {"load_friction": ("load_friction",)}
+    search = dataclasses.replace(search, state=state, aliases=aliases, select_chi2=state.held_out())
     fitted, drawn = resampled_values(search)
     assert fitted["load_friction", "external"] == 1.0
     assert {name for effect, name in drawn if effect == "load_friction"} == {"coefficient"}

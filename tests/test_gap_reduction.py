@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from go1exp.gap.replay.rows import Theta
+from go1exp.gap.result import Candidate
 from go1exp.gap.search import reduction, tolerances
+from go1exp.gap.search.search import Search
 from go1exp.robot import JOINTS
 from go1exp.sim.effects.tolerances import DECLARED
 
@@ -51,22 +53,19 @@ class Known:
         return np.full((30, 4), 100.0 if theta is NONE else self.chi2(self.terms))
 
 
-def search(state: Known, *rivals: Any) -> Any:
-    notes = SimpleNamespace(
-        state=state,
-        nominal=NONE,
-        rivals=list(rivals),
+def search(state: Any, *rivals: Any) -> Search:
+    evidence = tuple(Candidate(name, (), {}, 0.0, 1.0, 0.01, 2.0, (name,), "accepted", "") for name in state.terms)
+    return Search(
+        state,
+        np.random.default_rng(0),
+        lambda what, share: None,
         select_chi2=state.held_out(),
+        nominal=NONE,
         aliases={name: (name,) for name in state.terms},
-        strained=False,
         shares=dict.fromkeys(state.terms, 1.0),
-        returned={},
-        steps=[],
-        rejected=[],
-        rng=np.random.default_rng(0),
+        candidates=evidence,
+        rivals=rivals,
     )
-    notes.reject = lambda names, why: notes.rejected.append((tuple(names), why))
-    return notes
 
 
 @pytest.mark.parametrize(("difference", "name"), [(0.03, "coulomb"), (0.30, "asymmetric_friction")])
@@ -84,7 +83,7 @@ def test_friction_that_is_equal_both_ways_is_dry_friction(
 
     monkeypatch.setattr(reduction, "resampled", draws)
     asked = search(Known(lambda terms: 1.0 if "asymmetric_friction" in terms else 1.2, ("asymmetric_friction",), theta))
-    reduction.symmetrical(asked)
+    asked = reduction.symmetrical(asked)
     assert asked.state.terms == (name,)
     assert (name == "coulomb") == bool(asked.steps)
 
@@ -103,8 +102,9 @@ def test_a_simpler_effect_that_is_named_in_the_set_of_a_small_gap_takes_no_place
 ) -> None:
     friction = {("asymmetric_friction", way): np.full(12, 0.4) for way in ("forward", "backward")}
     asked = search(Known(lambda terms: 1.0, ("asymmetric_friction",), friction))
-    asked.strained, asked.aliases = strained, {"asymmetric_friction": ("asymmetric_friction", *alias)}
-    reduction.simplify(asked)
+    aliases = {"asymmetric_friction": ("asymmetric_friction", *alias)}
+    asked = replace(asked, strained=strained, aliases=aliases)
+    asked = reduction.simplify(asked)
     assert asked.state.terms == (name,)
 
 
@@ -122,7 +122,7 @@ def test_a_simpler_effect_at_its_bound_takes_no_place_of_one_that_is_at_none(
     values = dict(zip(("forward", "backward"), both_ways, strict=True))
     theta = {("asymmetric_friction", way): np.full(12, value) for way, value in values.items()}
     asked = search(Known(lambda terms: 1.0, ("asymmetric_friction",), theta))
-    reduction.simplify(asked)
+    asked = reduction.simplify(asked)
     assert asked.state.terms == (name,)
 
 
@@ -131,9 +131,9 @@ def test_one_cause_takes_the_place_of_two_if_it_does_as_well(alone: float, names
     two = Known(lambda terms: alone if terms == ("payload",) else 1.0, ("strength", "link_mass"), {})
     rival = SimpleNamespace(name="payload", theta={("payload", "mass"): np.array([2.0])})
     asked = search(two, rival)
-    reduction.unite(asked)
+    asked = reduction.unite(asked)
     assert asked.state.terms == names
-    assert bool(asked.rejected) == (names == ("payload",))
+    assert {c.status for c in asked.candidates} == {"rejected" if names == ("payload",) else "accepted"}
 
 
 @pytest.mark.parametrize(("loss", "joints"), [(0.0, {5}), (0.01, {3, 4, 5}), (0.2, {3, 4, 5})])
@@ -152,6 +152,6 @@ def test_a_term_is_kept_to_the_fewest_joints_that_held_out_windows_allow(
     monkeypatch.setattr(reduction, "Linear", lambda state: state)
     monkeypatch.setattr(reduction, "fewer", lambda linear, name, kept: [frozenset({3}), frozenset({5})])
     asked = search(Known(lambda terms: 1.0, ("link_mass",), theta, worse=worse))
-    reduction.concentrate(asked, "link_mass")
+    asked = reduction.concentrate(asked, "link_mass")
     assert {3, 4, 5} - {j for _, j in asked.state.kept} == joints
     assert bool(asked.steps) == (joints == {5})

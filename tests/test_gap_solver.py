@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +24,7 @@ from go1exp.gap.score.likelihood import gram
 from go1exp.gap.score.linear import Layout, predicted
 from go1exp.gap.search import significance, stepwise, thresholds, tolerances
 from go1exp.gap.search.fit import Model, scores
+from go1exp.gap.search.search import Search
 from go1exp.gap.search.significance import max_t
 from go1exp.gap.search.tolerances import Bounds, Freedom, solve
 from go1exp.gap.stages.explain import explain
@@ -306,8 +307,8 @@ def test_candidates_that_leave_next_to_nothing_are_fitted_to_their_end(
     left = {"viscous": 1.0, "lag": 90.0, "kd_scale": 1.2 * third}
     may = Freedom(DECLARED, frozenset())
     models = [Model(name, {}, may, (), np.full((8, 4), chi2)) for name, chi2 in left.items()]
-    search = SimpleNamespace(settings=QUICK, state=SimpleNamespace(scorer=None, table=None), dt=1e-3)
-    candidates = stepwise.Search._fitted_on(cast(stepwise.Search, search), models)
+    search: Any = SimpleNamespace(settings=QUICK, state=SimpleNamespace(scorer=None, table=None), dt=1e-3)
+    candidates = stepwise.fitted_on(search, models)
     assert [m.name for m in candidates] == [*left]
     assert rounds == expected
     assert [m.name for m in candidates if m.theta] == expected
@@ -322,29 +323,25 @@ def test_candidates_that_leave_next_to_nothing_are_fitted_to_their_end(
     ],
 )
 def test_where_little_is_left_and_nothing_alone_removes_it_what_strains_a_tolerance_is_asked(
-    left: float, asked: list[tuple[str, bool]]
+    left: float, asked: list[tuple[str, bool]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     judged, model = [], Model("base_tilt", {}, Freedom(DECLARED, frozenset()), ())
 
-    def judge(fitted: list[str], state: Any, train: Any, select: Any, small: bool) -> tuple[Model | None, None]:
+    def judge(
+        search: Search, fitted: list[str], state: Any, train: Any, select: Any, small: bool
+    ) -> tuple[Search, Model | None, None]:
         judged.append((*fitted, small))
-        return (model if fitted == ["leaning"] else None), None
+        return search, (model if fitted == ["leaning"] else None), None
 
-    search: Any = SimpleNamespace(
-        settings=GapSettings(),
-        state=SimpleNamespace(terms=(), loosened=(), train_chi2=None),
-        select_chi2=np.full((8, 4), 1.0 + left),
-        strained=False,
-        progress=lambda what, share: None,
-        _looks_at_all=lambda term, share, small: not small,
-        _screened=lambda: [],
-        _note_signals=lambda screened: None,
-        _fitted=lambda screened: ["screened"],
-        _leaning=lambda screened: ["leaning"],
-        _judged=judge,
-        _accept=lambda accepted: accepted is model,
-    )
-    accepted = stepwise.Search._advance(search)
+    monkeypatch.setattr(stepwise, "screened_by", lambda search: [])
+    monkeypatch.setattr(stepwise, "fitted_candidates", lambda search, screened: ["screened"])
+    monkeypatch.setattr(stepwise, "at_active_bounds", lambda search, screened: (search, ["leaning"]))
+    monkeypatch.setattr(stepwise, "judged", judge)
+    monkeypatch.setattr(stepwise, "accept", lambda search, accepted: (search, accepted is model))
+    state: Any = SimpleNamespace(terms=(), loosened=(), train_chi2=None, settings=GapSettings())
+    chi2 = np.full((8, 4), 1.0 + left)
+    search = Search(state, np.random.default_rng(0), lambda what, share: None, chi2, signal={"coulomb": 1.0})
+    search, accepted = stepwise.advance(search)
     assert judged == asked
     assert (accepted, search.strained) == (asked[-1][1], asked[-1][1])  # a strained term must be clear of doubt
 

@@ -20,8 +20,7 @@ from go1exp.gap.search import reduction, thresholds, tolerances
 from go1exp.gap.search.candidates import beyond, bounded, deviation, inaudible
 from go1exp.gap.search.certainty import beside_a_gap, doubt, resampled_values, widened
 from go1exp.gap.search.fit import residuals
-from go1exp.gap.search.ledger import LastCheck
-from go1exp.gap.search.stepwise import Search
+from go1exp.gap.search.search import LastCheck, Search
 from go1exp.sim.effects.base import Param
 from go1exp.sim.effects.tolerances import Tolerances, declared, sizes
 
@@ -59,8 +58,8 @@ class Answer:
     within: float = math.nan
 
 
-def concluded(search: Search, warnings: list[str]) -> Answer:
-    """Come to an answer: terms that held-out episodes or resamples do not support are withdrawn from the search.
+def concluded(search: Search, warnings: list[str]) -> tuple[Search, Answer]:
+    """Return the answer, and the search without the terms that held-out episodes or resamples do not support.
 
     Args:
         search: that is done.
@@ -70,14 +69,17 @@ def concluded(search: Search, warnings: list[str]) -> Answer:
     plain = excess(search.state.held_out({}))
     check = search.last_check()
     if search.state.terms and not check.helps and removed(search.first, search.steps[-1][1]) <= thresholds.HALF:
-        warnings.append(f"Withdrawn, since the last check does not bear it out: {', '.join(search.state.terms)}.")
-        search.withdraw("the last check does not bear it out")
+        warnings.append(f"Withdrawn, since the last check does not confirm it: {', '.join(search.state.terms)}.")
+        search = search.withdrawn("the last check does not confirm it")
     theta, drawn = resampled_values(search)
     weak = frozenset((effect, j) for effect in search.state.terms for j in weak_joints(search, effect, theta, drawn))
     at_bound = frozenset((effect, j) for effect in search.state.terms for j in bounded_joints(search, effect, theta))
     parts = [part for part in (weak, at_bound - weak) if part]
-    kept = [reduction.keep_within(search, search.state.kept | part) for part in parts]  # each on what the last one left
-    if any(kept):
+    sparse = search
+    for part in parts:
+        sparse = reduction.keep_within(sparse, sparse.state.kept | part) or sparse
+    if sparse is not search:
+        search = sparse
         check = search.last_check()
         theta, drawn = resampled_values(search)
     first, final = search.first, search.steps[-1][1]
@@ -85,7 +87,7 @@ def concluded(search: Search, warnings: list[str]) -> Answer:
     if named and (why := why_withdrawn(search, named, first)):
         doubtful = ", ".join(n.effect for n in named)
         warnings.append(f"Withdrawn, since the tolerances explain these logs and {why}: {doubtful}.")
-        search.withdraw(f"the tolerances suffice, and {why}")
+        search = search.withdrawn(f"the tolerances suffice, and {why}")
         final, theta, named = search.first, search.state.theta, ()
     within = share_accepted(search)
     verdict = decide(search, named, final, within >= thresholds.ACCEPTED_WINDOWS)
@@ -99,7 +101,7 @@ def concluded(search: Search, warnings: list[str]) -> Answer:
     unsure = {n.effect for n in named if n.status != "certified"}
     certain = {key: value for key, value in theta.items() if key[0] not in unsure}
     reached["written"] = excess(search.state.finer().held_out(certain, search.splits.judged))
-    return Answer(verdict, named, theta, reached, removed(first, final) if named else math.nan, within)
+    return search, Answer(verdict, named, theta, reached, removed(first, final) if named else math.nan, within)
 
 
 def why_withdrawn(search: Search, named: Sequence[NamedEffect], first: float) -> str:

@@ -14,7 +14,7 @@ from go1exp.gap.score.likelihood import removed
 from go1exp.gap.search import thresholds, tolerances
 from go1exp.gap.search.candidates import deviation
 from go1exp.gap.search.screen import free_shapes
-from go1exp.gap.search.stepwise import Search
+from go1exp.gap.search.search import Search
 from go1exp.sim.effects.tolerances import Tolerances, declared, effect_class, sizes
 
 

@@ -18,12 +18,12 @@ from go1exp.gap.score.linear import Layout, Table, table, unbiased_grams
 from go1exp.gap.search import significance, thresholds, tolerances
 from go1exp.gap.search.candidates import at_bound
 from go1exp.gap.search.fit import descend
-from go1exp.gap.search.ledger import LastCheck, Ledger
+from go1exp.gap.search.search import LastCheck, Search
 from go1exp.gap.search.state import State
 from go1exp.sim.effects.tolerances import sizes
 
 
-def resampled_values(search: Ledger) -> tuple[Theta, dict[Key, np.ndarray]]:
+def resampled_values(search: Search) -> tuple[Theta, dict[Key, np.ndarray]]:
     """Fit once more, on all windows but those for the last check, and bootstrap the fit; nothing to do without terms.
 
     Returns:
@@ -118,7 +118,7 @@ def semidefinite(matrix: np.ndarray) -> np.ndarray:
     return np.asarray(positive * scale[:, None] * scale)
 
 
-def on_bound(search: Ledger, effect: str, theta: Theta, joints: Sequence[str]) -> str:
+def on_bound(search: Search, effect: str, theta: Theta, joints: Sequence[str]) -> str:
     """Return which value of a term lies on the bound of its parameter, in words; empty if none does.
 
     Args:
@@ -142,7 +142,7 @@ def on_bound(search: Ledger, effect: str, theta: Theta, joints: Sequence[str]) -
     return ""
 
 
-def doubt(search: Ledger, effect: str, theta: Theta, joints: Sequence[str], adequate: bool, check: LastCheck) -> str:
+def doubt(search: Search, effect: str, theta: Theta, joints: Sequence[str], adequate: bool, check: LastCheck) -> str:
     """Return why a term is not certified; empty if it is.
 
     Args:
@@ -156,7 +156,7 @@ def doubt(search: Ledger, effect: str, theta: Theta, joints: Sequence[str], adeq
     stable, alone = search.shares.get(effect, 0.0), search.removes(effect)
     rivals = [name for name in search.aliases.get(effect, ()) if name != effect]
     if not check.helps:
-        return "the last check does not bear it out"
+        return "the last check does not confirm it"
     if not math.isnan(check.closed) and check.closed < thresholds.HALF:
         return f"on the last check only {max(check.closed, 0.0):.0%} of the excess goes"
     closes = adequate and search.first > search.settings.adequate
@@ -176,7 +176,7 @@ def doubt(search: Ledger, effect: str, theta: Theta, joints: Sequence[str], adeq
     return f"a gap remains, and {' and '.join(rivals)} would do as well" if rivals else ""
 
 
-def beside_a_gap(search: Ledger, effect: str) -> float:
+def beside_a_gap(search: Search, effect: str) -> float:
     """Return the relative half width that what remains adds to the 95 % intervals of a term's values.
 
     Args:

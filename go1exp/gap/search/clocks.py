@@ -21,7 +21,8 @@ from go1exp.gap.score.initial_state import rescaled
 from go1exp.gap.score.likelihood import Scorer, log_chi2
 from go1exp.gap.search import significance, thresholds
 from go1exp.gap.search.fit import residuals
-from go1exp.gap.search.stepwise import Search
+from go1exp.gap.search.search import Search, begun
+from go1exp.gap.search.stepwise import run
 
 
 @dataclass(frozen=True)
@@ -67,8 +68,7 @@ def contest(
                 on_progress(f"clock {name}, half {k + 1}: {what}", share)
 
             rng = np.random.default_rng(settings.seed)
-            searches[name] = Search(side.scorer, half, asked, side.dt, rng, show)
-            searches[name].run()
+            searches[name] = run(begun(side.scorer, half, asked, side.dt, rng, show))
             terms[name] |= dict.fromkeys(searches[name].state.terms)
         plain = {name: (side.scorer, searches[name].nominal) for name, side in sides.items()}
         nominal = nominal.also(plain, sides, half.select)

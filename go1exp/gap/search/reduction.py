@@ -15,7 +15,7 @@ from go1exp.gap.score.likelihood import excess, log_chi2, removed
 from go1exp.gap.score.linear import Layout, predicted
 from go1exp.gap.search import candidates, significance, thresholds, tolerances
 from go1exp.gap.search.certainty import bootstrapped
-from go1exp.gap.search.ledger import Ledger
+from go1exp.gap.search.search import Search
 from go1exp.gap.search.state import State
 from go1exp.sim.effects.tolerances import sizes
 
@@ -171,23 +171,31 @@ def _unmissed(
     )
 
 
-def eliminate(search: Ledger) -> None:
-    """Drop terms without which the rest does as well."""
+def reduced(search: Search) -> Search:
+    """Return the search with fewer and simpler terms, at fewer joints, where held-out windows are no worse."""
+    for step in (eliminate, unite, simplify, prune, symmetrical):
+        search = step(search)
+    return search
+
+
+def eliminate(search: Search) -> Search:
+    """Return the search without the terms without which the rest does as well."""
     for name in [t for t in search.state.terms if t != search.single and len(search.state.terms) > 1]:
         rest = search.state.without(name).settled(1)
         without = rest.held_out()
         gain = significance.gains(without, search.select_chi2[None])
         share = removed(excess(without), excess(search.select_chi2))
-        search.returned[name] = removed(search.first, search.first + excess(search.select_chi2) - excess(without))
+        back = removed(search.first, search.first + excess(search.select_chi2) - excess(without))
+        search = replace(search, returned={**search.returned, name: back})
         p = significance.max_t(gain, search.rng, len(search.state.machine.groups))
         shown = significance.shown(p, np.array([share]), excess(without), search.settings)
         if not share > search.settings.min_share or not shown[0]:
-            search.state, search.select_chi2 = rest, without
-            search.steps.append((f"without {name}", excess(without)))
+            search = search.with_model(rest, without, f"without {name}")
+    return search
 
 
-def simplify(search: Ledger) -> None:
-    """Replace terms by effects that explain as much with fewer numbers, where they do."""
+def simplify(search: Search) -> Search:
+    """Return the search with terms replaced by effects that explain as much with fewer numbers, where they do."""
     for name in search.state.terms:
         simpler = tolerances.identification(name).simpler
         if not simpler or simpler in search.state.terms:
@@ -199,15 +207,16 @@ def simplify(search: Ledger) -> None:
         gain, less = significance.gains(before, np.stack([after, rest.held_out()])).mean(axis=1)
         large = candidates.size(simpler, rest.theta, rest.tolerances) > 1.0
         joints, known = rest.machine.joints, rest.tolerances
-        strains = candidates.bounded(simpler, rest.theta, joints, known).any()
-        strained = candidates.bounded(name, search.state.theta, joints, known).any()
+        at_bound = candidates.bounded(simpler, rest.theta, joints, known).any()
+        was_at_bound = candidates.bounded(name, search.state.theta, joints, known).any()
         # What would go beyond its bound is a worse name than what need not: a hip of twice its mass, for a load.
-        if less > gain - significance.same(gain) and large and (strained or not strains):
-            replaced(search, name, simpler, rest, still_equal(search, name, simpler, rest))
+        if less > gain - significance.same(gain) and large and (was_at_bound or not at_bound):
+            search = replaced(search, name, simpler, rest, still_equal(search, name, simpler, rest))
+    return search
 
 
-def prune(search: Ledger) -> None:
-    """Bring back within tolerance what leaves it at a joint for too little (``gap/search/reduction.py``)."""
+def prune(search: Search) -> Search:
+    """Return the search with terms within tolerance at the joints where they bring too little."""
     linear, kept = Linear(search.state), search.state.kept
     for name in search.state.terms:
         theta, joints = search.state.theta, search.state.machine.joints
@@ -215,13 +224,14 @@ def prune(search: Ledger) -> None:
         inside = chosen(linear, name, kept, search.rng)
         kept |= {(name, int(j)) for j in outside if j not in inside}
     if kept != search.state.kept:
-        keep_within(search, kept)
+        search = keep_within(search, kept) or search
     for name in search.state.terms:
-        concentrate(search, name)
+        search = concentrate(search, name)
+    return search
 
 
-def concentrate(search: Ledger, name: str) -> None:
-    """Keep a term to the fewest joints with which, all else fitted again, held-out windows are no worse."""
+def concentrate(search: Search, name: str) -> Search:
+    """Return the search with a term at the fewest joints, if held-out windows are no worse with all else refitted."""
     linear, joints = Linear(search.state), search.state.machine.joints
     outside = np.flatnonzero(candidates.beyond(name, search.state.theta, joints, search.state.tolerances))
     for inside in fewer(linear, name, search.state.kept):
@@ -231,29 +241,26 @@ def concentrate(search: Ledger, name: str) -> None:
         loss = -significance.gains(search.select_chi2, chi2[None])
         worse = significance.max_t(loss, search.rng, len(search.state.machine.groups))[0]
         if loss.mean() < thresholds.SAME_GAIN and worse > thresholds.DOUBTFUL_P:
-            search.state, search.select_chi2 = sparse, chi2
-            search.steps.append(("at fewer joints", excess(chi2)))
-            return
+            return search.with_model(sparse, chi2, "at fewer joints")
+    return search
 
 
-def keep_within(search: Ledger, kept: frozenset[tuple[str, int]]) -> bool:
-    """Keep terms within tolerance at some joints, unless held-out windows miss that; return whether it was done.
+def keep_within(search: Search, kept: frozenset[tuple[str, int]]) -> Search | None:
+    """Return the search with terms within tolerance at some joints; None if held-out windows miss them there.
 
     Args:
-        search: whose state changes.
+        search: the present one.
         kept: effects and joints, those that are kept already among them.
     """
     sparse = search.state.keeping(kept).settled(2)
     chi2 = sparse.held_out()
     if significance.gains(search.select_chi2, chi2[None]).mean() < -thresholds.SAME_GAIN:
-        return False  # what looked small in the linear model was not
-    search.state, search.select_chi2 = sparse, chi2
-    search.steps.append(("at fewer joints", excess(chi2)))
-    return True
+        return None  # what looked small in the linear model was not
+    return search.with_model(sparse, chi2, "at fewer joints")
 
 
-def symmetrical(search: Ledger) -> None:
-    """Replace a term by the simpler effect that it is if two parameters are equal, where their difference may be 0."""
+def symmetrical(search: Search) -> Search:
+    """Return the search with the simpler effect for a term of which two parameters may be equal."""
     for name in search.state.terms:
         how = tolerances.identification(name)
         if not how.simpler_if_equal or how.simpler in search.state.terms:
@@ -268,10 +275,11 @@ def symmetrical(search: Ledger) -> None:
             continue
         rest = instead_of(search.state, name).settled(2)
         if candidates.size(how.simpler, rest.theta, rest.tolerances) > 1.0:
-            replaced(search, name, how.simpler, rest, still_equal(search, name, how.simpler, rest))
+            search = replaced(search, name, how.simpler, rest, still_equal(search, name, how.simpler, rest))
+    return search
 
 
-def still_equal(search: Ledger, name: str, instead: str, rest: State) -> tuple[str, ...]:
+def still_equal(search: Search, name: str, instead: str, rest: State) -> tuple[str, ...]:
     """Return which equals of a term do as well as the one that is to take its place (``rest``, fitted).
 
     They were equals of the term, which says nothing of another: each is fitted in its place.
@@ -300,28 +308,28 @@ def instead_of(state: State, name: str) -> State:
     return replace(rest, theta={**rest.theta, sizes(how.simpler)[0]: 0.5 * (one + other)})
 
 
-def resampled(search: Ledger) -> list[Theta]:
+def resampled(search: Search) -> list[Theta]:
     """Return values of the model by bootstraps of the windows of the fit, to first order."""
-    state = search.state
-    return list(
-        bootstrapped(state, state.table, state.train_chi2, search.rng, thresholds.EQUALITY_DRAWS, nominal=False)
+    state, draws = search.state, thresholds.EQUALITY_DRAWS
+    return list(bootstrapped(state, state.table, state.train_chi2, search.rng, draws, nominal=False))
+
+
+def replaced(search: Search, name: str, instead: str, rest: State, equals: tuple[str, ...] = ()) -> Search:
+    """Return the search with a fitted model that has another term in the place of one; ``equals`` do as well."""
+    search = replace(
+        search,
+        aliases={**search.aliases, instead: (instead, *equals)},
+        shares={**search.shares, instead: search.shares[name]},
+        returned={**search.returned, instead: search.returned.get(name, math.nan)},
     )
+    return search.with_model(rest, rest.held_out(), f"{instead} in place of {name}")
 
 
-def replaced(search: Ledger, name: str, instead: str, rest: State, equals: tuple[str, ...] = ()) -> None:
-    """Put a fitted model with another term in the place of the present one; ``equals`` do as well as that."""
-    search.state = rest
-    search.aliases[instead], search.shares[instead] = (instead, *equals), search.shares[name]
-    search.returned[instead] = search.returned.get(name, math.nan)
-    search.select_chi2 = rest.held_out()
-    search.steps.append((f"{instead} in place of {name}", excess(search.select_chi2)))
-
-
-def unite(search: Ledger) -> None:
-    """Replace several terms by one that does as well, if one does: a rival of the first that was set aside for it."""
+def unite(search: Search) -> Search:
+    """Return the search with one term for several, if one does as well: a rival of the first."""
     several = search.state.terms
     if len(several) < 2:
-        return
+        return search
     for model in search.rivals:
         if model.name in several:
             continue
@@ -333,6 +341,5 @@ def unite(search: Ledger) -> None:
         as_well = less > gain - significance.same(gain)
         as_well &= excess(chi2) <= excess(search.select_chi2) + thresholds.SAME_GAIN
         if as_well and candidates.size(model.name, rest.theta, rest.tolerances) > 1.0:
-            search.reject(several, f"{model.name} alone does as well")
-            replaced(search, several[0], model.name, rest)
-            return
+            return replaced(search.rejected(several, f"{model.name} alone does as well"), several[0], model.name, rest)
+    return search

@@ -21,6 +21,7 @@ from go1exp.gap.score.linear import table
 from go1exp.gap.search import profile_likelihood, reduction, significance, thresholds, tolerances
 from go1exp.gap.search.certainty import bootstrapped
 from go1exp.gap.search.fit import Model, fit, scores
+from go1exp.gap.search.search import Search
 from go1exp.gap.search.state import State
 from go1exp.sim.effects.tolerances import effect_class, sizes
 
@@ -164,53 +165,59 @@ def _off_alike(begun: Scorer, best: Theta, windows: np.ndarray, dt: float) -> Th
     return profile_likelihood.at_one_part(begun, everywhere, of_drives, reduction.parts(joints), windows, dt)
 
 
-Judge = Callable[[Sequence[Model], State, np.ndarray, np.ndarray], tuple[Model | None, Model | None]]
-"""Tests fitted candidates on held-out windows and notes the evidence (``Search._judged``)."""
+Judge = Callable[[Search, Sequence[Model], State, np.ndarray, np.ndarray], tuple[Search, Model | None, Model | None]]
+"""Tests fitted candidates on held-out windows (``stepwise.judged``)."""
 
 
-def cause(state: State, progress: Callable[[str, float], None], judged: Judge) -> Sought:
+def cause(search: Search, judged: Judge) -> tuple[Search, Sought]:
     """Return the effect of the whole robot, or alike at all joints, that explains nearly everything by itself, if any.
 
     Initial states that suit the nominal model hide a part of what is missing. So effects are compared by initial states
     of their own, and the best is fitted again at states that suit it.
 
     Args:
-        state: of a search that has not begun.
-        progress: called with what is being done, and which share of all is finished.
+        search: that has not begun.
         judged: tests the best effect.
+
+    Returns:
+        The search, whose evidence has the best effect if it was tested, and that effect.
     """
+    state = search.state
     train, select, dt, settings = state.splits.train, state.splits.select, state.dt, state.settings
     plain, now = (scores(state.scorer, [{}], part, dt)[0] for part in (train, select))
     if excess(now) < settings.material:
-        return Sought(None, {})
-    progress("looking for one cause alone", 0.08)
+        return search, Sought(None, {})
+    search.progress("looking for one cause alone", 0.08)
     begun = profile_likelihood.begun(state.scorer, dt)
     sought = clearest(begun, state)
     if sought.best is None:
-        return sought
-    best = _confirmed(sought.best, state, judged, plain, now)
+        return search, sought
+    search, best = _confirmed(sought.best, search, judged, plain, now)
     if best is not None:
-        return Sought(best, {})
-    return Sought(None, sought.within or _off_alike(begun, sought.best.theta, train, dt))
+        return search, Sought(best, {})
+    return search, Sought(None, sought.within or _off_alike(begun, sought.best.theta, train, dt))
 
 
-def _confirmed(best: Model, state: State, judged: Judge, plain: np.ndarray, now: np.ndarray) -> Model | None:
+def _confirmed(
+    best: Model, search: Search, judged: Judge, plain: np.ndarray, now: np.ndarray
+) -> tuple[Search, Model | None]:
     """Return the clearest cause fitted joint by joint at states that suit it, if it still is the one cause.
 
     Args:
         best: the cause.
-        state: of a search that has not begun.
+        search: that has not begun.
         judged: tests it.
         plain: (V, G) chi2 of the nominal model on the windows of the fit.
         now: the same on held-out windows.
     """
+    state = search.state
     if state.settings.effects and best.name not in state.settings.effects:
-        return None
+        return search, None
     for _ in range(thresholds.CAUSE_TURNS):
         state = replace(state, theta=best.theta).renewed()
         best = refitted(state.scorer, best, state.splits.train, state.dt)
     if not may_be(best, state):
-        return None
+        return search, None
     share = removed(excess(now), excess(state.held_out(best.theta)))
-    accepted, _ = judged([best], state, plain, now)
-    return best if accepted is not None and share >= thresholds.NEARLY_ALL else None
+    search, accepted, _ = judged(search, [best], state, plain, now)
+    return search, best if accepted is not None and share >= thresholds.NEARLY_ALL else None

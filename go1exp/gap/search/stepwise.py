@@ -1,326 +1,338 @@
-"""The stepwise search: fit what may move, screen, fit the best, judge, accept, and again."""
+"""The stepwise search: fit what may move, screen, fit the best, test, accept, and again."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from go1exp.gap.replay.rows import Theta
+from go1exp.gap.result import Candidate
 from go1exp.gap.score.likelihood import excess
 from go1exp.gap.search import candidates, reduction, significance, single_cause, thresholds, tolerances
 from go1exp.gap.search.candidates import Trial, tried
 from go1exp.gap.search.fit import Model, fit, misfit
-from go1exp.gap.search.ledger import Ledger
 from go1exp.gap.search.screen import Screened, library, motion, outside, rivals, screen
+from go1exp.gap.search.search import Search
 from go1exp.gap.search.state import State
 from go1exp.sim.effects.tolerances import sizes
 
+# ---------------------------------------------------------------------- the search
 
-@dataclass
-class Search(Ledger):
-    """A search in progress, and its result (``gap/search/ledger.py``)."""
 
-    # ------------------------------------------------------------------ the search
+def run(search: Search) -> Search:
+    """Return a search that is done."""
+    cause = None
+    if search.state.machine.on_ground:
+        search, cause = alone(search)
+    if cause is None and search.within and search.settings.calibrate:
+        # Joints that are all off within their tolerances: a fit at states of the nominal model finds a poor optimum.
+        search = replace(search, state=replace(search.state, theta=search.within).renewed())
+    search = fit_nominal(search)
+    if cause is not None:
+        search.progress(f"fitting the model with {cause.name}", 0.2)
+        search = with_term(search, cause)
+    on = True
+    while on and len(search.state.terms) < search.settings.max_terms:
+        search, on = advance(search)
+    if search.state.terms:
+        search.progress("is all of it needed", 0.85)
+        search = reduction.reduced(search)
+    sizes_of_terms = [candidates.size(t, search.state.theta, search.state.tolerances) for t in search.state.terms]
+    if search.strained and sizes_of_terms and max(sizes_of_terms) <= thresholds.CLEARLY_BEYOND:
+        return search.withdrawn("it leaves its tolerance by too little to be called missing")
+    return search
 
-    def run(self) -> None:
-        """Search."""
-        cause = self.single_cause() if self.state.machine.on_ground else None
-        if cause is None and self.within and self.settings.calibrate:
-            # Of twelve joints that are each off within their tolerances a fit at states of the nominal model finds a
-            # poor optimum: drives and masses that are all off alike had 26 times the floor left.
-            self.state = replace(self.state, theta=self.within).renewed()
-        self._fit_nominal()
-        if cause is not None:
-            self.progress(f"fitting the model with {cause.name}", 0.2)
-            self.state, self.select_chi2 = self._with_term(cause)
-        while len(self.state.terms) < self.settings.max_terms and self._advance():
-            pass
-        if self.state.terms:
-            self.progress("is all of it needed", 0.85)
-            reduction.eliminate(self)
-            reduction.unite(self)
-            reduction.simplify(self)
-            reduction.prune(self)
-            reduction.symmetrical(self)
-        sizes_of_terms = [candidates.size(t, self.state.theta, self.state.tolerances) for t in self.state.terms]
-        if self.strained and sizes_of_terms and max(sizes_of_terms) <= thresholds.CLEARLY_BEYOND:
-            self.withdraw("it leaves its tolerance by too little to be called missing")
 
-    def single_cause(self) -> Model | None:
-        """Return the effect of the whole robot that explains nearly everything alone, if there is one."""
-        sought = single_cause.cause(self.state, self.progress, self._judged)
-        self.single, self.within = sought.best.name if sought.best else "", sought.within
-        return sought.best
+def alone(search: Search) -> tuple[Search, Model | None]:
+    """Look for the effect of the whole robot that explains nearly everything alone; return it, if there is one."""
+    search, sought = single_cause.cause(search, judged)
+    return replace(search, single=sought.best.name if sought.best else "", within=sought.within), sought.best
 
-    def measure_signals(self) -> None:
-        """Only measure how much each effect would show (``signal``)."""
-        self.state = self.state.settled(1)
-        self._note_signals(self._screened())
 
-    def _fit_nominal(self) -> None:
-        """Fit the model within its tolerances."""
-        self.progress("fitting the model within its tolerances", 0.1)
-        self.state = self.state.settled(3)
-        self.select_chi2 = self.state.held_out()
-        self.nominal, self.first = self.state.theta, excess(self.select_chi2)
-        self.steps.append(("within tolerances", self.first))
+def with_signals(search: Search) -> Search:
+    """Return the search with how much each effect would show (``signal``), and nothing else."""
+    search = replace(search, state=search.state.settled(1))
+    return noting_signals(search, screened_by(search))
 
-    def _advance(self) -> bool:
-        """Look for one more term, or one more effect to move within its tolerance; return whether to go on."""
-        term = len(self.state.terms) + 1
-        share = 0.15 + 0.7 * (term - 1) / self.settings.max_terms
-        small = excess(self.select_chi2) < self.settings.material
-        screened = self._screened() if self._looks_at_all(term, share, small) else []
-        self._note_signals(screened)
-        self.progress(f"fitting candidates for term {term}", share + 0.06)
-        fitted = self._leaning(screened) if small else self._fitted(screened)
-        accepted, inside = self._judged(fitted, self.state, self.state.train_chi2, self.select_chi2, small)
-        if accepted is None and inside is None and not small and excess(self.select_chi2) <= self.settings.adequate:
-            # Little is left, and nothing alone removes it: several tolerances may make up for what is missing.
-            small = True
-            fitted = self._leaning(screened)
-            accepted, inside = self._judged(fitted, self.state, self.state.train_chi2, self.select_chi2, small)
-        if accepted is not None:
-            self.progress(f"fitting the model with {accepted.name}", share + 0.12)
-            self.strained |= small and not self.state.terms
-            return self._accept(accepted)
-        if inside is None or len(self.state.loosened) == thresholds.MOST_RELAXED:
-            return False
-        self.progress(f"fitting the model with {inside.name}", share + 0.12)
-        self._loosen(inside)
-        return True
 
-    def _looks_at_all(self, term: int, share: float, small: bool) -> bool:
-        """Return whether all effects are screened: not where no gap is left, once their signals are known."""
-        if small and self.signal:
-            return False
-        self.progress(f"screening for term {term}", share)
-        return True
+def fit_nominal(search: Search) -> Search:
+    """Return the search with the model fitted within its tolerances."""
+    search.progress("fitting the model within its tolerances", 0.1)
+    state = search.state.settled(3)
+    chi2 = state.held_out()
+    search = search.with_model(state, chi2, "within tolerances")
+    return replace(search, nominal=state.theta, first=excess(chi2))
 
-    def _leaning(self, screened: Sequence[Screened]) -> list[Model]:
-        """Return fitted candidates where the tolerances close the gap: none unless something strains them.
 
-        Args:
-            screened: what screening says of every effect; it is asked if that is nothing, and needed.
-        """
-        within = tolerances.nominal(self.state.machine)
-        relief = tolerances.relief(self.state.scorer, self.state.table, self.state.may)
-        values = tolerances.values(self.state.scorer, self.state.table)
-        straining = tolerances.straining(relief, values, [*self.state.terms, *self._unasked()])
-        missing = outside(screened, within)
-        if not straining and not missing:
-            self._note_absorbed(relief)
-            return []
-        if not straining:
-            return self._fitted(missing)
-        given_back = [self._given_back(effect, self.state.theta) for effect in straining]
-        taken_for = rivals(screened or self._screened(), straining, within)
-        fitted = [self._given_back(s.variant.effect, s.theta, thresholds.RIVAL_ROUNDS) for s in taken_for]
-        return given_back + [replace(m, keys=s.variant.free) for m, s in zip(fitted, taken_for, strict=True)]
+def advance(search: Search) -> tuple[Search, bool]:
+    """Look for one more term, or one more effect to move within its tolerance; return whether to go on."""
+    term = len(search.state.terms) + 1
+    share = 0.15 + 0.7 * (term - 1) / search.settings.max_terms
+    small = excess(search.select_chi2) < search.settings.material
+    screened: list[Screened] = []
+    if not (small and search.signal):  # all effects, but not where no gap is left and their signals are known
+        search.progress(f"screening for term {term}", share)
+        screened = screened_by(search)
+    search = noting_signals(search, screened)
+    search.progress(f"fitting candidates for term {term}", share + 0.06)
+    search, fitted = at_active_bounds(search, screened) if small else (search, fitted_candidates(search, screened))
+    now = (search.state, search.state.train_chi2, search.select_chi2)
+    search, accepted, inside = judged(search, fitted, *now, small)
+    if accepted is None and inside is None and not small and excess(search.select_chi2) <= search.settings.adequate:
+        # Little is left, and nothing alone removes it: several tolerances may make up for what is missing.
+        small = True
+        search, fitted = at_active_bounds(search, screened)
+        search, accepted, inside = judged(search, fitted, *now, small)
+    if accepted is not None:
+        search.progress(f"fitting the model with {accepted.name}", share + 0.12)
+        search = replace(search, strained=search.strained or (small and not search.state.terms))
+        return accept(search, accepted)
+    if inside is None or len(search.state.loosened) == thresholds.MOST_RELAXED:
+        return search, False
+    search.progress(f"fitting the model with {inside.name}", share + 0.12)
+    return loosened(search, inside), True
 
-    def _accept(self, model: Model) -> bool:
-        """Make a candidate a term, unless the model is worse with all else fitted again; return whether it is one."""
-        first = self.first
-        state, chi2 = self._with_term(model)
-        if excess(chi2) <= excess(state.held_out(self.state.theta)) + thresholds.SAME_GAIN:  # by the same floors
-            self.state, self.select_chi2 = state, chi2
-            return True
-        self.steps.pop()
-        self.measured_again(first)
-        self.reject([model.name], "with all else fitted again the held-out error grows")
-        return False
 
-    def _with_term(self, model: Model) -> tuple[State, np.ndarray]:
-        """Return the state with a candidate as a term and all else fitted again, and chi2 of held-out windows."""
-        terms = (*self.state.terms, model.name)
-        loosened = tuple(name for name in self.state.loosened if name != model.name)
-        # What the box had taken on in place of the effect it gives back: it starts from the nominal values.
-        theta = {key: value for key, value in model.theta.items() if key[0] in (*terms, *loosened)}
-        state = replace(self.state, terms=terms, loosened=loosened, theta=theta)
-        renews, held = state.scorer.renewed is not None, not state.machine.on_ground
-        if renews and (held or model.name == self.single):
-            # A loaded link answers its initial state otherwise: by the plain model's answer the truth has twice the
-            # floor's chi2, and a fit spreads the load over its neighbours and the drives.
-            state = state.renewed()
-        state = state.settled(4)
-        if renews:
-            state = state.renewed().settled(2 if held else 1)
-        chi2, plain = state.held_out(), state.held_out(model.theta)
-        # With little data, what was fitted from scratch can be a poorer optimum.
-        if excess(plain) < excess(chi2) - thresholds.SAME_GAIN:
-            state, chi2 = state.at(model.theta), plain
-        self.measured_again(excess(state.held_out(self.nominal)))  # by the same floors
-        self.steps.append((model.name, excess(chi2)))
-        return state, chi2
+def accept(search: Search, model: Model) -> tuple[Search, bool]:
+    """Make a candidate a term, unless the model is worse with all else refitted; return whether it is one."""
+    after = with_term(search, model)
+    before = excess(after.state.held_out(search.state.theta))  # by the same floors
+    if excess(after.select_chi2) <= before + thresholds.SAME_GAIN:
+        return after, True
+    return search.rejected([model.name], "with all else fitted again the held-out error grows"), False
 
-    def _loosen(self, model: Model) -> None:
-        """Let an effect move within its tolerance."""
-        loosened = (*self.state.loosened, model.name)
-        self.state = replace(self.state, loosened=loosened, theta=model.theta).settled(2)
-        self.select_chi2 = self.state.held_out()
-        if not self.state.terms:
-            self.nominal, self.first, self.base = self.state.theta, excess(self.select_chi2), len(self.steps)
-        self.steps.append((f"{model.name} within its tolerance", excess(self.select_chi2)))
 
-    # ------------------------------------------------------------------ candidates
+def with_term(search: Search, model: Model) -> Search:
+    """Return the search with a candidate as a term and all else refitted."""
+    terms = (*search.state.terms, model.name)
+    others = tuple(name for name in search.state.loosened if name != model.name)
+    # What the box had taken on in place of the effect it gives back: it starts from the nominal values.
+    theta = {key: value for key, value in model.theta.items() if key[0] in (*terms, *others)}
+    state = replace(search.state, terms=terms, loosened=others, theta=theta)
+    renews, held = state.scorer.renewed is not None, not state.machine.on_ground
+    if renews and (held or model.name == search.single):
+        # Initial states that suit the plain model give the truth twice the floor's chi2 under a loaded link.
+        state = state.renewed()
+    state = state.settled(4)
+    if renews:
+        state = state.renewed().settled(2 if held else 1)
+    chi2, plain = state.held_out(), state.held_out(model.theta)
+    # With little data, what was fitted from scratch can be a poorer optimum.
+    if excess(plain) < excess(chi2) - thresholds.SAME_GAIN:
+        state, chi2 = state.at(model.theta), plain
+    search = search.measured_again(excess(state.held_out(search.nominal)))  # by the same floors
+    return search.with_model(state, chi2, model.name)
 
-    def _screened(self) -> list[Screened]:
-        """Rank all ways in which an effect could be missing, on some of the windows of the fit."""
-        linear, machine = self.state.table, self.state.machine
-        moved = motion(self.state.scorer.windows, machine.effort)
-        variants = library(machine, moved, [*self.state.terms, *self.state.loosened])
-        if self.settings.effects:
-            variants = [v for v in variants if v.effect in self.settings.effects]
-        count = len(linear.windows)
-        # Half of the windows that are looked at are the worst, half are spread evenly.
-        worst = np.argsort(-self.state.scorer.chi2(linear.residual, linear.windows).sum(1))[
-            : thresholds.SCREENED_WINDOWS // 2
-        ]
-        evenly = np.linspace(0, count - 1, min(thresholds.SCREENED_WINDOWS // 2, count)).astype(int)
-        part = linear.part(np.unique([*worst, *evenly]))
-        return screen(self.state.scorer, self.state.theta, part, self.state.may, variants, self.dt)
 
-    def _note_signals(self, screened: Sequence[Screened]) -> None:
-        for s in screened:
-            self.signal[s.variant.effect] = max(self.signal.get(s.variant.effect, 0.0), s.signal)
+def loosened(search: Search, model: Model) -> Search:
+    """Return the search with an effect that may move within its tolerance."""
+    names = (*search.state.loosened, model.name)
+    state = replace(search.state, loosened=names, theta=model.theta).settled(2)
+    chi2, base = state.held_out(), len(search.steps)
+    without_terms = not search.state.terms
+    search = search.with_model(state, chi2, f"{model.name} within its tolerance")
+    return replace(search, nominal=state.theta, first=excess(chi2), base=base) if without_terms else search
 
-    def _note_absorbed(self, relief: dict[str, float]) -> None:
-        """Note which effects of the tolerance box the data would rather have outside it."""
-        if not self.state.terms:  # beside a term they are no rivals of it
-            state, most = self.state, self.settings.shortlist
-            self.candidates += candidates.absorbed(state.keys, relief, state.theta, state.tolerances, most)
 
-    def _unasked(self) -> list[str]:
-        """Return the effects that the user does not want to be considered."""
-        wanted = self.settings.effects
-        return [e for e in tolerances.nominal(self.state.machine) if wanted and e not in wanted]
+# ---------------------------------------------------------------------- candidates
 
-    def _freed(self, effect: str) -> Model:
-        """Return the model in which an effect of the tolerance box may leave its tolerance, fitted."""
-        model = Model(effect, self.state.theta, self.state.may.also(effect), sizes(effect))
-        return fit(self.state.scorer, [model], self.state.table, self.settings.iterations, self.dt)[0]
 
-    def _given_back(self, effect: str, theta: Theta, rounds: int = 2) -> Model:
-        """Return the model in which an effect may leave its tolerance, and the others begin at their nominal values.
+def screened_by(search: Search) -> list[Screened]:
+    """Rank all ways in which an effect could be missing, on some of the windows of the fit."""
+    state = search.state
+    linear, machine = state.table, state.machine
+    moved = motion(state.scorer.windows, machine.effort)
+    variants = library(machine, moved, [*state.terms, *state.loosened])
+    if search.settings.effects:
+        variants = [v for v in variants if v.effect in search.settings.effects]
+    count, half = len(linear.windows), thresholds.SCREENED_WINDOWS // 2
+    # Half of the windows that are looked at are the worst, half are spread evenly.
+    worst = np.argsort(-state.scorer.chi2(linear.residual, linear.windows).sum(1))[:half]
+    evenly = np.linspace(0, count - 1, min(half, count)).astype(int)
+    part = linear.part(np.unique([*worst, *evenly]))
+    return screen(state.scorer, state.theta, part, state.may, variants, search.dt)
 
-        Several effects within their tolerances make up for it together, at next to no cost: from there a fit of few
-        steps hardly comes away.
 
-        Args:
-            effect: the candidate.
-            theta: values of which those of the candidate and of the terms are kept.
-            rounds: of fitting, at most.
-        """
-        terms = (*self.state.terms, effect)
-        kept = {key: value for key, value in theta.items() if key[0] in (*terms, *self.state.loosened)}
-        state = replace(self.state, terms=terms, theta=kept).settled(rounds)
-        return Model(effect, state.theta, state.may, sizes(effect), state.train_chi2, state.table.residual)
+def noting_signals(search: Search, screened: Sequence[Screened]) -> Search:
+    """Return the search with the largest signal of each effect so far."""
+    signal = dict(search.signal)
+    for s in screened:
+        signal[s.variant.effect] = max(signal.get(s.variant.effect, 0.0), s.signal)
+    return replace(search, signal=signal)
 
-    def _fitted(self, screened: Sequence[Screened]) -> list[Model]:
-        """Return models of the best candidates, fitted.
 
-        They start from what screening made of a few windows, and what looks hopeless after a step is given up. Where
-        the model is near the data both may mislead: effects of the tolerance box are also fitted each on its own, from
-        where they are, and the better fit counts. So may it where the best candidate is one that another is easily
-        taken for: that one is fitted from nominal values of all else, too.
-        """
-        chosen: dict[str, Screened] = {}
-        for s in screened:
-            if len(chosen) < self.settings.shortlist and s.gain > 0.0:
-                chosen.setdefault(s.variant.effect, s)
-        may = self.state.may
-        models = [Model(effect, s.theta, may.also(effect), s.variant.free) for effect, s in chosen.items()]
-        fitted = fit(self.state.scorer, models, self.state.table, self.settings.iterations, self.dt) if models else []
-        fitted = self._fitted_on(fitted)
-        near = excess(self.select_chi2) <= self.settings.adequate
-        movable = {key[0] for key in self.state.keys} if near else set()
-        again = [self._freed(m.name) if m.name in movable else m for m in fitted]
-        better = [min(pair, key=misfit) for pair in zip(fitted, again, strict=True)]
-        best = min(better, key=misfit).name if better else ""
-        return [
-            min(m, self._given_back(m.name, m.theta), key=misfit) if tolerances.confounded(m.name, best) else m
-            for m in better
-        ]
+def at_active_bounds(search: Search, screened: Sequence[Screened]) -> tuple[Search, list[Model]]:
+    """Return fitted candidates where the tolerances close the gap: none without an active bound.
 
-    def _fitted_on(self, fitted: Sequence[Model]) -> list[Model]:
-        """Return candidates, of which those that leave next to nothing are fitted on, if there are several.
+    Args:
+        search: whose evidence lists the effects of bounds that are not active enough.
+        screened: what screening says of every effect; it is done here if it is empty, and needed.
+    """
+    state = search.state
+    within = tolerances.nominal(state.machine)
+    relief = tolerances.relief(state.scorer, state.table, state.may)
+    values = tolerances.values(state.scorer, state.table)
+    wanted = search.settings.effects
+    unasked = [e for e in within if wanted and e not in wanted]
+    active = tolerances.straining(relief, values, [*state.terms, *unasked])
+    missing = outside(screened, within)
+    if not active and not missing:
+        if not state.terms:  # beside a term they are no rivals of it
+            rows = candidates.absorbed(state.keys, relief, state.theta, state.tolerances, search.settings.shortlist)
+            search = replace(search, candidates=(*search.candidates, *rows))
+        return search, []
+    if not active:
+        return search, fitted_candidates(search, missing)
+    refits = [refitted(state, effect, state.theta) for effect in active]
+    taken_for = rivals(screened or screened_by(search), active, within)
+    fitted = [refitted(state, s.variant.effect, s.theta, thresholds.RIVAL_ROUNDS) for s in taken_for]
+    return search, refits + [replace(m, keys=s.variant.free) for m, s in zip(fitted, taken_for, strict=True)]
 
-        They may do equally well, and one whose fit ended a little early would be called worse than the others.
-        """
-        near = [m for m in fitted if m.chi2 is not None and excess(m.chi2) <= self.settings.adequate]
-        if len(near) < 2:
-            return [*fitted]
-        ended = fit(self.state.scorer, near, self.state.table, self.settings.iterations, self.dt)
-        by_name = {m.name: m for m in (*fitted, *ended)}
-        return [by_name[m.name] for m in fitted]
 
-    # ------------------------------------------------------------------ judgement
+def freed(search: Search, effect: str) -> Model:
+    """Return the model in which an effect of the tolerance box may leave its tolerance, fitted."""
+    state = search.state
+    model = Model(effect, state.theta, state.may.also(effect), sizes(effect))
+    return fit(state.scorer, [model], state.table, search.settings.iterations, search.dt)[0]
 
-    def _judged(
-        self, fitted: Sequence[Model], state: State, train: np.ndarray, select: np.ndarray, small: bool = False
-    ) -> tuple[Model | None, Model | None]:
-        """Test fitted candidates on held-out windows and note the evidence.
 
-        Args:
-            fitted: the candidates.
-            state: with the scorer that counts.
-            train: (V, G) chi2 of the present model on the windows of the fit.
-            select: the same on held-out windows.
-            small: whether the gap is small, so that which share of it a candidate removes means nothing.
+def refitted(state: State, effect: str, theta: Theta, rounds: int = 2) -> Model:
+    """Return the model in which an effect may leave its tolerance, and the others begin at their nominal values.
 
-        Returns:
-            The one to accept, and the best of those that help within their tolerances.
-        """
-        if not fitted:
-            return None, None
-        windows = self.splits.select
-        trial = tried(state.scorer, self.settings, fitted, train, select, windows, self.dt, self.rng, small)
-        alias = sorted(np.flatnonzero(trial.alias).tolist(), key=lambda k: -trial.mean[k])
-        names = tuple(fitted[k].name for k in alias)
-        self._note_trial(trial, fitted, names)
-        helps = [k for k in range(len(fitted)) if trial.helps[k] and trial.sizes[k] <= 1.0]
-        inside = fitted[max(helps, key=lambda k: trial.mean[k])] if helps else None
-        if trial.chosen is None:
-            return None, inside
-        accepted = fitted[trial.chosen]
-        if not self.state.terms:
-            near = trial.mean > thresholds.EQUAL_SHARE * trial.mean[trial.chosen]
-            order = [k for k in np.argsort(-trial.mean) if near[k] and trial.sizes[k] > 1.0 and k != trial.chosen]
-            self.rivals = [fitted[k] for k in order[: thresholds.RIVALS]]
-        self.aliases[accepted.name] = (accepted.name, *(n for n in names if n != accepted.name))
-        on_train = significance.gains(train, np.stack([m.chi2 for m in fitted if m.chi2 is not None]))
-        every = np.concatenate([on_train, trial.gain], axis=1)
-        self.shares[accepted.name] = self._bootstrap_share(every[~trial.aside], trial.alias[~trial.aside])
-        return accepted, inside
+    Several effects within their tolerances make up for it together, at next to no cost: from there a fit of few
+    steps hardly comes away.
 
-    def _note_trial(self, trial: Trial, fitted: Sequence[Model], aliases: tuple[str, ...]) -> None:
-        """Add the candidates of a trial to the evidence, best first."""
-        for k in np.argsort(-trial.mean):
-            status, reason = trial.reason(int(k))
-            self.candidates.append(
-                candidates.candidate(
-                    fitted[k],
-                    self.scorer.windows.joints,
-                    excess_after=trial.after[k],
-                    log_gain=float(trial.mean[k]),
-                    p=float(trial.p[k]),
-                    alias_class=aliases if trial.alias[k] else (fitted[k].name,),
-                    status=status,
-                    reason=reason,
-                    stage=len(self.state.terms) + 1,
-                )
+    Args:
+        state: the present model.
+        effect: the candidate.
+        theta: values of which those of the candidate and of the terms are kept.
+        rounds: of fitting, at most.
+    """
+    terms = (*state.terms, effect)
+    kept = {key: value for key, value in theta.items() if key[0] in (*terms, *state.loosened)}
+    state = replace(state, terms=terms, theta=kept).settled(rounds)
+    return Model(effect, state.theta, state.may, sizes(effect), state.train_chi2, state.table.residual)
+
+
+def fitted_candidates(search: Search, screened: Sequence[Screened]) -> list[Model]:
+    """Return models of the best candidates, fitted.
+
+    They start from the linear model of a few windows, and what looks hopeless after a step is given up. Where the model
+    is near the data, effects of the tolerance box are also fitted each on its own, and the better fit counts. An effect
+    that is easily taken for the best candidate is refitted from nominal values of all else, too.
+    """
+    state, settings = search.state, search.settings
+    chosen: dict[str, Screened] = {}
+    for s in screened:
+        if len(chosen) < settings.shortlist and s.gain > 0.0:
+            chosen.setdefault(s.variant.effect, s)
+    models = [Model(effect, s.theta, state.may.also(effect), s.variant.free) for effect, s in chosen.items()]
+    fitted = fit(state.scorer, models, state.table, settings.iterations, search.dt) if models else []
+    fitted = fitted_on(search, fitted)
+    near = excess(search.select_chi2) <= settings.adequate
+    movable = {key[0] for key in state.keys} if near else set()
+    again = [freed(search, m.name) if m.name in movable else m for m in fitted]
+    better = [min(pair, key=misfit) for pair in zip(fitted, again, strict=True)]
+    best = min(better, key=misfit).name if better else ""
+    return [
+        min(m, refitted(state, m.name, m.theta), key=misfit) if tolerances.confounded(m.name, best) else m
+        for m in better
+    ]
+
+
+def fitted_on(search: Search, fitted: Sequence[Model]) -> list[Model]:
+    """Return candidates, of which those that leave next to nothing are fitted on, if there are several.
+
+    They may do equally well, and one whose fit ended a little early would be called worse than the others.
+    """
+    near = [m for m in fitted if m.chi2 is not None and excess(m.chi2) <= search.settings.adequate]
+    if len(near) < 2:
+        return [*fitted]
+    ended = fit(search.state.scorer, near, search.state.table, search.settings.iterations, search.dt)
+    by_name = {m.name: m for m in (*fitted, *ended)}
+    return [by_name[m.name] for m in fitted]
+
+
+# ---------------------------------------------------------------------- held-out tests
+
+
+def judged(
+    search: Search,
+    fitted: Sequence[Model],
+    state: State,
+    train: np.ndarray,
+    select: np.ndarray,
+    small: bool = False,
+) -> tuple[Search, Model | None, Model | None]:
+    """Test fitted candidates on held-out windows.
+
+    Args:
+        search: whose evidence takes the candidates.
+        fitted: the candidates.
+        state: with the scorer that counts.
+        train: (V, G) chi2 of the present model on the windows of the fit.
+        select: the same on held-out windows.
+        small: whether the gap is small, so that which share of it a candidate removes means nothing.
+
+    Returns:
+        The search, the candidate to accept, and the best of those that help within their tolerances.
+    """
+    if not fitted:
+        return search, None, None
+    windows, settings = search.splits.select, search.settings
+    trial = tried(state.scorer, settings, fitted, train, select, windows, search.dt, search.rng, small)
+    alias = sorted(np.flatnonzero(trial.alias).tolist(), key=lambda k: -trial.mean[k])
+    names = tuple(fitted[k].name for k in alias)
+    search = replace(search, candidates=(*search.candidates, *_evidence(search, trial, fitted, names)))
+    helps = [k for k in range(len(fitted)) if trial.helps[k] and trial.sizes[k] <= 1.0]
+    inside = fitted[max(helps, key=lambda k: trial.mean[k])] if helps else None
+    if trial.chosen is None:
+        return search, None, inside
+    accepted = fitted[trial.chosen]
+    if not search.state.terms:
+        near = trial.mean > thresholds.EQUAL_SHARE * trial.mean[trial.chosen]
+        order = [k for k in np.argsort(-trial.mean) if near[k] and trial.sizes[k] > 1.0 and k != trial.chosen]
+        search = replace(search, rivals=tuple(fitted[k] for k in order[: thresholds.RIVALS]))
+    on_train = significance.gains(train, np.stack([m.chi2 for m in fitted if m.chi2 is not None]))
+    every = np.concatenate([on_train, trial.gain], axis=1)
+    share = _bootstrap_share(search, every[~trial.aside], trial.alias[~trial.aside])
+    equals = (accepted.name, *(n for n in names if n != accepted.name))
+    aliases, shares = {**search.aliases, accepted.name: equals}, {**search.shares, accepted.name: share}
+    return replace(search, aliases=aliases, shares=shares), accepted, inside
+
+
+def _evidence(search: Search, trial: Trial, fitted: Sequence[Model], aliases: tuple[str, ...]) -> list[Candidate]:
+    """Return the candidates of a trial as they are reported, best first."""
+    rows = []
+    for k in np.argsort(-trial.mean):
+        status, reason = trial.reason(int(k))
+        rows.append(
+            candidates.candidate(
+                fitted[k],
+                search.state.scorer.windows.joints,
+                excess_after=trial.after[k],
+                log_gain=float(trial.mean[k]),
+                p=float(trial.p[k]),
+                alias_class=aliases if trial.alias[k] else (fitted[k].name,),
+                status=status,
+                reason=reason,
+                stage=len(search.state.terms) + 1,
             )
+        )
+    return rows
 
-    def _bootstrap_share(self, gain: np.ndarray, alias: np.ndarray) -> float:
-        """Return the share of bootstraps in which the chosen candidate, or its equal (``alias``), gains most."""
-        episode = self.scorer.windows.episode[np.concatenate([self.splits.train, self.splits.select])]
-        episode = np.repeat(episode, len(self.state.machine.groups))
-        wins = 0
-        for _ in range(self.settings.bootstraps):
-            picked = significance.resampled(episode, self.rng)
-            mean = gain[:, picked].mean(axis=1)
-            close = mean >= mean.max() - significance.same(mean.max())
-            wins += bool(close[alias].any())
-        return wins / max(self.settings.bootstraps, 1)
+
+def _bootstrap_share(search: Search, gain: np.ndarray, alias: np.ndarray) -> float:
+    """Return the share of bootstraps in which the chosen candidate, or its equal (``alias``), gains most."""
+    state, count = search.state, search.settings.bootstraps
+    episode = state.scorer.windows.episode[np.concatenate([search.splits.train, search.splits.select])]
+    episode = np.repeat(episode, len(state.machine.groups))
+    wins = 0
+    for _ in range(count):
+        picked = significance.resampled(episode, search.rng)
+        mean = gain[:, picked].mean(axis=1)
+        close = mean >= mean.max() - significance.same(mean.max())
+        wins += bool(close[alias].any())
+    return wins / max(count, 1)

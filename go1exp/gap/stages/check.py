@@ -15,7 +15,8 @@ from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score.angle_errors import localise
 from go1exp.gap.score.likelihood import excess
 from go1exp.gap.search.fit import residuals
-from go1exp.gap.search.stepwise import Search
+from go1exp.gap.search.search import begun
+from go1exp.gap.search.stepwise import with_signals
 from go1exp.logs.recording import Recording
 from go1exp.robot.config import RobotConfig
 
@@ -97,8 +98,7 @@ def check(
         if screen:
             on_progress("what these logs can show", 0.6)
             parts = comparison.split(rng)
-            search = Search(score, parts, comparison.settings, comparison.dt, rng, lambda what, share: None)
-            search.measure_signals()
+            search = with_signals(begun(score, parts, comparison.settings, comparison.dt, rng))
             silent = not_excited(search.signal, held=can_stand(comparison.robot))
     on_progress("done", 1.0)
     error_of_all = excess(score.chi2(plain, everything))

@@ -22,7 +22,8 @@ from go1exp.gap.score.angle_errors import angle_errors, localise
 from go1exp.gap.score.likelihood import Scorer, excess
 from go1exp.gap.search import clocks
 from go1exp.gap.search.fit import residuals
-from go1exp.gap.search.stepwise import Search
+from go1exp.gap.search.search import Search, begun
+from go1exp.gap.search.stepwise import run
 from go1exp.gap.search.tolerances import identification
 from go1exp.gap.sentence import advice, sentence
 from go1exp.logs.recording import Recording
@@ -98,7 +99,7 @@ def _explained(
         warnings += comparison.ready.warnings
         search = searched(comparison, rng, warnings, on_progress)
         on_progress("intervals", 0.88)
-        answer = concluded(search, warnings)
+        search, answer = concluded(search, warnings)
         warnings += doubts(answer.named, search.state.machine.on_ground)
         on_progress("where it is wrong", 0.93)
         about = provenance(comparison, search, recordings, settings)
@@ -128,8 +129,7 @@ def searched(comparison: Comparison, rng: np.random.Generator, warnings: list[st
         )
     if not len(parts.confirm):
         warnings.append("Too few episodes to keep some for a last check.")
-    search = Search(comparison.scorer, parts, settings, comparison.dt, rng, on_progress)
-    search.run()
+    search = run(begun(comparison.scorer, parts, settings, comparison.dt, rng, on_progress))
     if not len(parts.confirm) or search.state.terms or search.first > settings.adequate:
         return search
     unseen = excess(search.state.held_out(windows=parts.confirm))
@@ -139,9 +139,8 @@ def searched(comparison: Comparison, rng: np.random.Generator, warnings: list[st
         f"Windows kept for a last check show an error of {1 + unseen:.3g} times the floor, others do not: "
         "they were taken into the search, with nothing left for a last check."
     )
-    search = Search(comparison.scorer, comparison.split(rng, confirm=0.0), settings, comparison.dt, rng, on_progress)
-    search.run()
-    return search
+    parts = comparison.split(rng, confirm=0.0)
+    return run(begun(comparison.scorer, parts, settings, comparison.dt, rng, on_progress))
 
 
 def written(
