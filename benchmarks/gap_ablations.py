@@ -28,7 +28,7 @@ PLAN: dict[str, tuple[int, str]] = {
     "single": (27, "3"),
     "outside": (11, "1"),
 }
-"""Kind -> number of cases, and size of single effects in tolerances: every effect of a hung robot once."""
+"""Kind -> number of cases, and size of single effects in tolerances: every effect of a suspended robot once."""
 
 METHODS: dict[str, tuple[str, dict[str, str]]] = {
     "whole": ("the search as it is", {}),

@@ -29,7 +29,7 @@ PLAN: dict[str, tuple[int, str]] = {
     "null": (104, "1,2,5"),
     "near_null": (100, "1,2,5"),
 }
-"""Kind -> number of cases, and sizes of single effects in tolerances: every effect of a hung robot at both."""
+"""Kind -> number of cases, and sizes of single effects in tolerances: every effect of a suspended robot at both."""
 
 
 def merged(out: Path, kinds: Sequence[str]) -> score.Score:

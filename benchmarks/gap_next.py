@@ -40,7 +40,7 @@ from go1exp.gap.design.rehearsal import Rehearsal, Stage
 from go1exp.gap.design.settings import DesignSettings
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import GapSettings
-from go1exp.gap.robots.go1 import hung
+from go1exp.gap.robots.go1 import suspended
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.stages.explain import explain
 from go1exp.logs.record.plan import Episode, make_motion
@@ -99,7 +99,7 @@ class Bench:
         self.case, self.seed, self.rng = case, seed, np.random.default_rng(seed)
         self.rig = Rig(**parts, physics_dt=0.0005)
         self.sensors: SensorConfig = parse(SensorConfig, container["sensors"])
-        self.robot: Robot = hung(parts["robot"])
+        self.robot: Robot = suspended(parts["robot"])
         self.settings = GapSettings(threads=threads, physics_dt=0.002)
         self.recordings: list[Recording] = []
         for k in range(2):

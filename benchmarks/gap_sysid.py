@@ -9,8 +9,8 @@ model (delay, lag, strength, backlash) cannot be named. Writes ``OUT/<case>/verd
 unless given) for ``benchmarks.gap.score`` and skips a case that has one. Needs ``mujoco[sysid]``.
 
 To take about a minute a case: RK4 at the period of the log, and one perturbed replay for all four legs, which a held
-trunk keeps apart. To spare it what a hung robot's logs cannot tell: roll of the trunk is left to the hips' encoders
-(the same thing, as the hips turn about that axis), and the hip links share one scale of mass.
+trunk keeps apart. Two things are not identifiable on a suspended robot: roll of the trunk is left to the hips' encoders
+(the hips turn about that axis), and the hip links share one scale of mass.
 """
 
 from __future__ import annotations

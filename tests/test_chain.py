@@ -16,7 +16,7 @@ from go1exp import cli
 from go1exp.base.paths import data_root
 from go1exp.config.compose import compose
 from go1exp.gap.result import GapSettings
-from go1exp.gap.robots.go1 import hung
+from go1exp.gap.robots.go1 import suspended
 from go1exp.gap.stages.replay import Part, replay
 from go1exp.logs import recording
 from go1exp.logs.recording import Recording, joint_channels
@@ -53,7 +53,7 @@ def replayed(log: Recording, shift: int) -> Part:
     names = joint_channels("q_target", log.meta.joints)
     channels = {n: np.roll(v, shift) if n in names else v for n, v in log.channels.items()}
     moved = dataclasses.replace(log, channels={name: values[1:-1] for name, values in channels.items()})
-    machine = hung(parse_parts(compose("gap", ["logs=x"]), ("robot",))[0]["robot"])
+    machine = suspended(parse_parts(compose("gap", ["logs=x"]), ("robot",))[0]["robot"])
     (part,) = replay([moved], machine, GapSettings(threads=1), STEP).parts
     return part
 

@@ -55,7 +55,7 @@ from go1exp.deploy.sim_robot.server import TRUTH, Network, Truth
 from go1exp.evaluate.controller.adapters import Deployed
 from go1exp.evaluate.controller.mpc import Mpc
 from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
-from go1exp.gap.robots.go1 import hung
+from go1exp.gap.robots.go1 import suspended
 from go1exp.logs import recording
 from go1exp.logs.audit import audit
 from go1exp.logs.record.motions import played
@@ -372,7 +372,7 @@ def test_the_log_is_fit_for_gap_and_says_nothing_of_what_it_does_not_know(file: 
     done = play(file, tmp_path, job={"sim": {"noise": 0.1}, "other": {"effect": {"coulomb": {"bound": 0.4}}}})
     assert "coulomb" not in done.recording.meta.notes
     assert not any(name.startswith("base_") for name in done.recording.channels)
-    standing = hung(bundle_task(file, {}).robot).suited([done.recording])
+    standing = suspended(bundle_task(file, {}).robot).suited([done.recording])
     assert standing.flaws(done.recording, audit(done.recording)) == []
 
 

@@ -21,7 +21,7 @@ from go1exp.config.schema.physics import MUJOCO_CONTACT, ContactConfig
 from go1exp.gap import files
 from go1exp.gap.comparison import prepare
 from go1exp.gap.result import AngleErrors, Candidate, Floors, GapResult, GapSettings, Localisation, NamedEffect, Overlay
-from go1exp.gap.robots.go1 import hung
+from go1exp.gap.robots.go1 import suspended
 from go1exp.gap.stages.apply import CALIBRATION, COMPENSATING, EFFECT, composed, prove, terms_of, theta_of, write
 from go1exp.gap.stages.explain import explain
 from go1exp.logs.audit import audit
@@ -167,7 +167,7 @@ def test_the_public_face_of_gap_has_every_name_that_it_promises() -> None:
 def test_training_is_offered_only_where_there_is_something_to_train_with(capsys: pytest.CaptureFixture[str]) -> None:
     from go1exp.cli.gap import _print_next
 
-    robot = hung(parse_parts(compose("gap", ["logs=x"]), ("robot",))[0]["robot"])
+    robot = suspended(parse_parts(compose("gap", ["logs=x"]), ("robot",))[0]["robot"])
     _print_next({}, robot, Path("gap/effect.yaml"))
     empty = capsys.readouterr().out
     assert "train" not in empty.replace("training", "")
@@ -388,7 +388,7 @@ def test_what_is_not_for_training_is_not_asked_of_the_proof(tmp_path: Path) -> N
 
 def test_logs_of_another_robot_or_without_what_is_needed_are_refused() -> None:
     rig, (recording, *_) = robot()
-    machine, meta = hung(rig.robot), recording.meta
+    machine, meta = suspended(rig.robot), recording.meta
     assert machine.flaws(recording, audit(recording)) == []
     swapped = replace(recording, meta=replace(meta, joints=(*meta.joints[1:], meta.joints[0])))
     bare = {k: v for k, v in recording.channels.items() if not k.startswith("qd_")}
@@ -411,7 +411,7 @@ def test_logs_of_another_robot_or_without_what_is_needed_are_refused() -> None:
 def test_one_bad_log_of_many_is_left_out_and_said() -> None:
     rig, recordings = robot()
     stuck = {**recordings[0].channels, "q_FR_hip": np.full(len(recordings[0].t), 0.1)}
-    _, ready = prepare([replace(recordings[0], channels=stuck), *recordings[1:]], hung(rig.robot), GapSettings())
+    _, ready = prepare([replace(recordings[0], channels=stuck), *recordings[1:]], suspended(rig.robot), GapSettings())
     assert ready.recordings == recordings[1:]
     assert ready.warnings
     assert all(w.startswith(f"Left out: {recordings[0].meta.episode}: ") for w in ready.warnings)

@@ -12,7 +12,7 @@ from go1exp import robot
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import bind
 from go1exp.gap.replay.replayer import LEVEL, hold
-from go1exp.gap.robots.go1 import hung
+from go1exp.gap.robots.go1 import suspended
 from go1exp.sim.env.plant import Plant
 from go1exp.sim.task import parse_parts
 
@@ -22,7 +22,7 @@ DT, STEPS = 0.001, 300
 
 def moved(num: int, built: Any, quats: np.ndarray | None, mounted: bool, effects: dict[str, Any]) -> torch.Tensor:
     """Return where the joints (N, 12) of robots are that step from rest."""
-    machine = hung(parse_parts(compose("gap", ["logs=none"]), ("robot",))[0]["robot"])
+    machine = suspended(parse_parts(compose("gap", ["logs=none"]), ("robot",))[0]["robot"])
     backend, setup = machine.build(num, DT, built, 1, mounted)
     if quats is not None:
         hold(backend, quats)

@@ -28,7 +28,7 @@ from go1exp.gap.report import tables
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
 from go1exp.gap.robots.choice import robot_of
 from go1exp.gap.robots.description import parse_model
-from go1exp.gap.robots.go1 import HungGo1, StandingGo1
+from go1exp.gap.robots.go1 import StandingGo1, SuspendedGo1
 from go1exp.gap.score.initial_state import settled
 from go1exp.gap.search import profile_likelihood, tolerances
 from go1exp.gap.search.screen import Motion, library
@@ -100,7 +100,7 @@ def test_the_model_has_the_contact_that_recordings_name_or_that_is_chosen() -> N
         (hard, MUJOCO_CONTACT, MUJOCO_CONTACT),
         ((*soft, *hard), ELLIPTIC, ELLIPTIC),
     ):
-        standing = HungGo1(config, contact=chosen).suited(recordings)
+        standing = SuspendedGo1(config, contact=chosen).suited(recordings)
         assert isinstance(standing, StandingGo1)
         assert standing.tolerances.param(KEY).null == wanted.time_constant
         model = standing.build(1, 0.001, (1.0, 0.0, 0.0, 0.0), 1)[0].model
@@ -135,9 +135,9 @@ def test_the_command_refuses_them_and_takes_a_choice(tmp_path: Path, capsys: pyt
 def test_a_robot_that_hangs_feels_no_contact_whatever_its_recordings_name() -> None:
     config, _ = recorded("excitation=[squat,drop]")
     hung = [naming(STIFF, "fixed"), naming(MUJOCO_CONTACT, "fixed")]
-    assert HungGo1(config).suited(hung) == HungGo1(config)
+    assert SuspendedGo1(config).suited(hung) == SuspendedGo1(config)
     assert contact_of([*hung, naming(STIFF)], None) == STIFF
-    swinging = HungGo1(config).suited([naming(STIFF), naming(MUJOCO_CONTACT)], "swing")
+    swinging = SuspendedGo1(config).suited([naming(STIFF), naming(MUJOCO_CONTACT)], "swing")
     assert swinging.tolerances.contact is None
 
 
@@ -180,7 +180,7 @@ def test_a_hard_robot_is_probed_within_the_bounds_and_a_soft_one_as_before() -> 
     idle = Motion(*(np.zeros(12) for _ in range(4)))
 
     def levels(contact: ContactConfig) -> list[float]:
-        machine = HungGo1(config, contact=contact).suited(soft)
+        machine = SuspendedGo1(config, contact=contact).suited(soft)
         ways = [v for v in library(machine, idle) if v.effect == "ground_compliance"]
         return [float(v.probes[0].delta[0]) for v in ways]
 
@@ -193,7 +193,7 @@ def test_a_value_is_what_it_says_under_every_contact_and_null_is_continuous() ->
     config, recordings = recorded("excitation=[squat,drop]", "contact=stiff")
 
     def replayed(contact: ContactConfig, value: float | None) -> np.ndarray:
-        machine, ready = prepare(recordings, HungGo1(config, contact=contact), QUICK)
+        machine, ready = prepare(recordings, SuspendedGo1(config, contact=contact), QUICK)
         windows = machine.windows(ready)
         replayer: Replayer = machine.replayer(windows, np.tile([1.0, 0, 0, 0], (len(windows), 1)), 512, 1)
         theta = {} if value is None else {KEY: np.array([value])}
@@ -233,7 +233,7 @@ def test_a_spread_needs_a_value_to_be_about() -> None:
 
 def search_in(recordings: tuple[Recording, ...], config: RobotConfig, contact: ContactConfig | None) -> Search:
     """Return a search that has not begun."""
-    machine, ready = prepare(recordings, HungGo1(config, contact=contact), QUICK)
+    machine, ready = prepare(recordings, SuspendedGo1(config, contact=contact), QUICK)
     windows = machine.windows(ready)
     replayer = machine.replayer(windows, np.tile([1.0, 0, 0, 0], (len(windows), 1)), 512, 1)
     score, _ = settled(replayer, 0.001, 0.00015)
@@ -314,14 +314,14 @@ def test_a_box_value_at_null_is_not_written_and_the_file_says_the_contact(tmp_pa
 
 def test_an_answer_is_proved_with_its_own_contact() -> None:
     config, _ = recorded("excitation=[squat,drop]")
-    assert apply.read_as(HungGo1(config), answer(STIFF)) == HungGo1(config, contact=STIFF)
-    assert apply.read_as(HungGo1(config), answer(None)) == HungGo1(config)
+    assert apply.read_as(SuspendedGo1(config), answer(STIFF)) == SuspendedGo1(config, contact=STIFF)
+    assert apply.read_as(SuspendedGo1(config), answer(None)) == SuspendedGo1(config)
     with pytest.raises(files.GapFileError, match=r"contact: 20 ms.*; 5 ms.* in the search"):
-        apply.read_as(HungGo1(config, contact=MUJOCO_CONTACT), answer(STIFF))
+        apply.read_as(SuspendedGo1(config, contact=MUJOCO_CONTACT), answer(STIFF))
 
 
 def test_steps_of_probes_stay_within_the_bounds_of_a_hard_robot() -> None:
     config, soft = recorded("excitation=[squat,drop]")
-    machine = HungGo1(config, contact=STIFF).suited(soft)
+    machine = SuspendedGo1(config, contact=STIFF).suited(soft)
     (probe,) = tolerances.probes(machine, [KEY], {})
     assert probe.delta == pytest.approx([0.1 * 0.003])

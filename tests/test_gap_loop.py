@@ -117,7 +117,7 @@ def test_nothing_named_ends_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (["support=ground"], "support = 'ground': designs are for a robot that is hung"),
+        (["support=ground"], "support = 'ground': designs are for a suspended robot"),
         (["model=go2"], "model: the simulated robot is a Go1"),
         (["excitation=[policy]"], "excitation: motions only"),
         (["rounds=-1"], "rounds = -1"),

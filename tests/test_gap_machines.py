@@ -28,7 +28,7 @@ from go1exp.gap.result import GapSettings
 from go1exp.gap.robots.choice import robot_of
 from go1exp.gap.robots.description import ModelConfig, parse_model
 from go1exp.gap.robots.fixed_base import FixedBase
-from go1exp.gap.robots.go1 import HungGo1
+from go1exp.gap.robots.go1 import SuspendedGo1
 from go1exp.gap.search import tolerances
 from go1exp.gap.search.certainty import resampled_values
 from go1exp.gap.search.ledger import LastCheck
@@ -184,7 +184,7 @@ def test_a_wrong_description_is_told_by_its_key(changes: Mapping[str, Any], said
 
 def test_the_go1_is_the_model_without_a_file() -> None:
     robot: Any = object()
-    assert robot_of(parse_model({"mjcf": None}), robot) == HungGo1(robot)
+    assert robot_of(parse_model({"mjcf": None}), robot) == SuspendedGo1(robot)
     with pytest.raises(ConfigError, match=r"model.mjcf: is null, which is the Go1; base would do nothing"):
         parse_model({"mjcf": None, "base": "trunk"})
     with pytest.raises(ConfigError, match=r"model = 'go7': must be a choice"):
@@ -210,7 +210,7 @@ def test_a_users_own_file_names_its_model_from_where_it_lies(tmp_path: Path) -> 
 
 def test_a_robot_carries_its_tolerances_and_another_robot_beside_it_has_others() -> None:
     key = ("base_tilt", "roll")
-    go2, go1 = machine("go2"), HungGo1(None)  # type: ignore[arg-type]
+    go2, go1 = machine("go2"), SuspendedGo1(None)  # type: ignore[arg-type]
     assert go2.tolerances.param(key).tolerance == 0.05
     assert go1.tolerances.param(key) == declared(key)
 

@@ -14,7 +14,7 @@ from go1exp.base.paths import data_root
 from go1exp.config.schema import registry
 from go1exp.config.schema.registry import members
 from go1exp.gap import answer, sentence
-from go1exp.gap.robots.go1 import HungGo1, StandingGo1
+from go1exp.gap.robots.go1 import StandingGo1, SuspendedGo1
 from go1exp.gap.score.linear import Layout
 from go1exp.gap.search import tolerances
 from go1exp.gap.search.screen import Motion, free_shapes, library
@@ -57,7 +57,7 @@ class Robots:
     """A held Go1 and one on its feet, with nothing of their configuration."""
 
     config: RobotConfig = None  # type: ignore[assignment]
-    held = HungGo1(config)
+    held = SuspendedGo1(config)
     standing = StandingGo1(config, held)
 
 

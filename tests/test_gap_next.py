@@ -27,7 +27,7 @@ from go1exp.gap.replay.rows import Theta, variants
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
 from go1exp.gap.robots.description import ModelConfig
 from go1exp.gap.robots.fixed_base import FixedBase
-from go1exp.gap.robots.go1 import hung
+from go1exp.gap.robots.go1 import suspended
 from go1exp.gap.score.linear import Layout
 from go1exp.gap.search import tolerances
 from go1exp.gap.stages import next as stage_next
@@ -320,7 +320,7 @@ def answer(**changes: Any) -> GapResult:
 def robot() -> Any:
     from tests.test_gap_solver import simulate_config
 
-    return hung(simulate_config())
+    return suspended(simulate_config())
 
 
 def test_a_named_effect_is_held_against_all_that_is_known_to_look_like_it() -> None:

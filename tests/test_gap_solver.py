@@ -19,7 +19,7 @@ from go1exp.gap.data.windows import held, splits
 from go1exp.gap.replay.replayer import padded
 from go1exp.gap.replay.rows import Probe
 from go1exp.gap.result import EXIT_CODES, GapResult, GapSettings
-from go1exp.gap.robots.go1 import HungGo1, hung
+from go1exp.gap.robots.go1 import SuspendedGo1, suspended
 from go1exp.gap.score.likelihood import gram
 from go1exp.gap.score.linear import Layout, predicted
 from go1exp.gap.search import significance, stepwise, thresholds, tolerances
@@ -81,7 +81,7 @@ def test_normal_equations_promise_what_the_model_gives() -> None:
     rng = np.random.default_rng(2)
     joints = np.ones(12)
     probes = [Probe(("coulomb", "bound"), 0, joints), Probe(("base_tilt", "roll"), None, np.ones(1))]
-    machine = HungGo1(simulate_config())
+    machine = SuspendedGo1(simulate_config())
     layout = Layout.from_probes(machine, probes)
     assert layout.size == 5
     np.testing.assert_array_equal(layout.joint, [0, 3, 6, 9, -1])
@@ -260,7 +260,7 @@ def test_a_clock_need_not_start_at_zero(plain: tuple[simulate.Rig, list[Recordin
     weaker = {("strength_drift", "rate"): np.full(12, 0.05)}
     chi2 = []
     for logs in (found, late):
-        comparison = compare(logs, hung(rig.robot), QUICK)
+        comparison = compare(logs, suspended(rig.robot), QUICK)
         windows = comparison.windows
         np.testing.assert_allclose(windows.elapsed, windows.begin - 1000.0 * (logs is late), atol=2e-3)
         chi2.append(scores(comparison.scorer, [weaker], np.arange(len(windows)), 0.001)[0])

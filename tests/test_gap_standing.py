@@ -19,7 +19,7 @@ from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.rows import Probe, Theta, variants
 from go1exp.gap.replay.walking import StandingReplayer
 from go1exp.gap.result import GapSettings
-from go1exp.gap.robots.go1 import HungGo1, StandingGo1
+from go1exp.gap.robots.go1 import StandingGo1, SuspendedGo1
 from go1exp.gap.score.angle_errors import ON_FEET, REGIMES, localise
 from go1exp.gap.score.initial_state import settled
 from go1exp.gap.score.likelihood import Scorer, excess
@@ -94,7 +94,7 @@ def test_a_walking_base_is_estimated_where_two_feet_agree_and_nowhere_else() -> 
 
 def ready(config: RobotConfig, recordings: tuple[Recording, ...]) -> tuple[StandingReplayer, float]:
     """Return the replayer of ``QUICK`` windows, and its step."""
-    machine, done = prepare(recordings, HungGo1(config), QUICK)
+    machine, done = prepare(recordings, SuspendedGo1(config), QUICK)
     windows = machine.windows(done)
     level = np.tile([1.0, 0.0, 0.0, 0.0], (len(windows), 1))
     replayer = machine.replayer(windows, level, 512, 1)
@@ -162,8 +162,8 @@ def test_regimes_of_the_ground_follow_the_feet() -> None:
 def test_hung_windows_among_standing_ones_are_replayed_as_by_themselves() -> None:
     config, recordings = recorded("excitation=[squat,gait]")
     _, hung = recorded("excitation=[chirp]", "support=suspended")
-    assert isinstance(HungGo1(config).suited((*recordings, *hung)), StandingGo1)
-    assert isinstance(HungGo1(config).suited(hung), HungGo1)
+    assert isinstance(SuspendedGo1(config).suited((*recordings, *hung)), StandingGo1)
+    assert isinstance(SuspendedGo1(config).suited(hung), SuspendedGo1)
     replayer, dt = ready(config, (*recordings, *hung))
     windows = replayer.windows
     assert isinstance(windows, StandingWindows)
@@ -172,7 +172,7 @@ def test_hung_windows_among_standing_ones_are_replayed_as_by_themselves() -> Non
     assert np.isinf(windows.scale[held, 2]).all()
     probes = [Probe(("coulomb", "bound"), 1, np.full(12, 0.2))]
     found = replayer.run(variants(replayer.machine, {}, held, probes), dt)
-    alone = Replayer(HungGo1(config), windows.plain(), replayer.quats, 512, 1)
+    alone = Replayer(SuspendedGo1(config), windows.plain(), replayer.quats, 512, 1)
     expected = alone.run(variants(alone.machine, {}, held, []), dt)
     np.testing.assert_allclose(found[::2, :, :2], expected, atol=1e-12)
     assert np.abs(found[1::2] - found[::2]).max() > 1e-3

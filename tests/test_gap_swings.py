@@ -17,7 +17,7 @@ from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.rows import Theta, variants
 from go1exp.gap.replay.walking import SwingReplayer, packed_by_leg
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
-from go1exp.gap.robots.go1 import HungGo1, StandingGo1, SwingingGo1
+from go1exp.gap.robots.go1 import StandingGo1, SuspendedGo1, SwingingGo1
 from go1exp.gap.score.angle_errors import localise, of_angles
 from go1exp.gap.score.likelihood import excess, state_probes
 from go1exp.gap.search import tolerances
@@ -50,7 +50,7 @@ def recorded(*overrides: str) -> tuple[RobotConfig, tuple[Recording, ...]]:
 def exact() -> Comparison:
     """Return a walk of which every sensor is exact, beside the model at a quarter of the usual step."""
     config, recordings = recorded("sensors.jitter=0.0", *EXACT)
-    return compare(recordings, HungGo1(config), SWING, physics_dt=0.0005)
+    return compare(recordings, SuspendedGo1(config), SWING, physics_dt=0.0005)
 
 
 def unexplained(comparison: Comparison, theta: Theta | None = None) -> np.ndarray:
@@ -128,7 +128,7 @@ def test_legs_in_the_air_follow_the_free_robot_and_not_without_the_motion_of_its
 
 def test_an_imu_that_sits_tilted_is_turned_back() -> None:
     config, recordings = recorded("+effect.base_tilt.pitch=0.1", "+effect.base_tilt.roll=-0.06", *EXACT)
-    comparison = compare(recordings, HungGo1(config), SWING, physics_dt=0.0005)
+    comparison = compare(recordings, SuspendedGo1(config), SWING, physics_dt=0.0005)
     tilted = {("base_tilt", "pitch"): np.array([0.1]), ("base_tilt", "roll"): np.array([-0.06])}
     assert np.median(unexplained(comparison, tilted)) < 0.5 * np.median(unexplained(comparison))
 
@@ -148,7 +148,7 @@ def test_legs_share_simulations_and_move_as_in_one_for_each_row() -> None:
 
 def test_a_walk_like_the_model_scores_the_floor_joint_by_joint() -> None:
     config, recordings = recorded()
-    comparison = compare(recordings, HungGo1(config), SWING)
+    comparison = compare(recordings, SuspendedGo1(config), SWING)
     residual = residuals(comparison.scorer, [{}], comparison.everything, comparison.dt)[0]
     chi2 = comparison.scorer.chi2(residual, comparison.everything)
     assert chi2.mean() == pytest.approx(0.85, abs=0.2)
@@ -162,7 +162,7 @@ def test_a_walk_like_the_model_scores_the_floor_joint_by_joint() -> None:
 
 def test_the_phase_says_what_of_a_walk_is_compared() -> None:
     config, recordings = recorded()
-    machine = HungGo1(config)
+    machine = SuspendedGo1(config)
     assert isinstance(machine.suited(recordings, "swing"), SwingingGo1)
     assert isinstance(machine.suited(recordings, "whole"), StandingGo1)
     assert isinstance(machine.suited(recordings, "auto"), StandingGo1)
@@ -209,13 +209,13 @@ def test_an_offset_that_only_a_robot_on_its_feet_shows_comes_with_a_warning(
 ) -> None:
     one = NamedEffect(effect, ("FR_calf",), {}, {}, (effect,), "certified")
     lines = stages_explain.doubts([one], on_ground)
-    assert [("record it hung" in line) for line in lines] == [True] * warned
+    assert [("record it suspended" in line) for line in lines] == [True] * warned
 
 
 def test_a_robot_that_never_lifts_a_foot_is_told_so() -> None:
     config, recordings = recorded("excitation=[squat]")
     with pytest.raises(NotComparable, match="no leg swings"):
-        compare(recordings, HungGo1(config), SWING)
+        compare(recordings, SuspendedGo1(config), SWING)
 
 
 SEARCH = ("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")

@@ -24,7 +24,7 @@ from go1exp.gap.report import tables, text, write_report
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
 from go1exp.gap.robots.choice import robot_of
 from go1exp.gap.robots.description import parse_model
-from go1exp.gap.robots.go1 import hung
+from go1exp.gap.robots.go1 import suspended
 from go1exp.gap.search import candidates, tolerances
 from go1exp.gap.stages.apply import prove, write
 from go1exp.gap.stages.explain import explain
@@ -209,7 +209,7 @@ def test_friction_that_is_within_the_users_tolerance_is_no_gap(monkeypatch: pyte
         ["physics_dt=0.0005", "seconds=3.0", "excitation=[chirp]", "gains=[[20,0.5],[35,0.6],[35,1.2]]"],
         {"coulomb": {"bound": {"calf": 0.3}}},
     )
-    worse_known = hung(rig.robot, Tolerances.from_effects({"coulomb": {"bound": 0.5}}))
+    worse_known = suspended(rig.robot, Tolerances.from_effects({"coulomb": {"bound": 0.5}}))
     result = explain(logs, worse_known, QUICK)
     assert result.verdict == "no gap"
     assert result.tolerances["coulomb"] == {"bound": 0.5}

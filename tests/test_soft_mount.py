@@ -28,7 +28,7 @@ from go1exp.gap.replay.rows import Rows, Theta, bolted, mounted, variants
 from go1exp.gap.result import GapSettings
 from go1exp.gap.robots.description import ModelConfig, parse_model
 from go1exp.gap.robots.fixed_base import FixedBase
-from go1exp.gap.robots.go1 import hung
+from go1exp.gap.robots.go1 import suspended
 from go1exp.gap.score.angle_errors import unexplained
 from go1exp.gap.score.likelihood import state_probes
 from go1exp.gap.search.fit import stacked
@@ -277,7 +277,7 @@ def test_a_free_trunk_has_no_mount() -> None:
 @cache
 def replayer() -> Replayer:
     """Four windows of one recording of a Go1 that hangs."""
-    machine, recordings = hung(task().robot), read_folder(data_root() / "assets/demo/suspended_go1")[:1]
+    machine, recordings = suspended(task().robot), read_folder(data_root() / "assets/demo/suspended_go1")[:1]
     windows = machine.windows(Ready(tuple(recordings), GapSettings(stride_s=0.4)))
     return machine.replayer(windows, np.tile(LEVEL, (len(windows), 1)), 64, 1)
 
@@ -364,7 +364,7 @@ def test_a_hidden_mount_is_named_with_its_values_and_not_taken_for_a_tilt_or_ine
         bootstraps=20,
         overlays=1,
     )
-    result = explain(recordings, hung(rig.robot), settings)
+    result = explain(recordings, suspended(rig.robot), settings)
     assert [n.effect for n in result.named] == ["soft_mount"]
     values = result.named[0].params
     assert values["roll"]["robot"] == pytest.approx(0.012, rel=0.15)

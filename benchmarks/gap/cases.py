@@ -40,14 +40,14 @@ NOT_EXCITED: dict[str, tuple[str, ...]] = {
     "torque_delay": ("ramps",),
     "payload": EVERYTHING,
 }
-"""Effect -> motions that do not show it (the trunk of a hung robot may weigh what it likes)."""
+"""Effect -> motions that do not show it (the trunk of a suspended robot may weigh what it likes)."""
 
 DAMAGES = (
     *("swapped_joints", "flipped_sign", "dropped", "shifted_commands", "degrees", "truncated", "frozen", "repeated"),
 )
 
 HUNG = tuple(e for e in known.LIBRARY if e not in (*known.GROUND_ONLY, *known.NEVER_HIDDEN))
-"""Effects that a hung robot feels."""
+"""Effects that a suspended robot feels."""
 
 Values = dict[str, np.ndarray | float]
 

@@ -112,7 +112,7 @@ def make(name: str, seed: int, ground: Ground) -> Hidden:
 
 
 def record_hung(hidden: Hidden, name: str, seed: int, count: int, seconds: float) -> list[Recording]:
-    """Return ``count`` recordings of the hung robot, the last one a repetition of another."""
+    """Return ``count`` recordings of the suspended robot, the last one a repetition of another."""
     rng = _rng(name, seed, 1)
     drawn = cases.experiment(cases.EVERYTHING, count, seconds, rng)
     gains = {e.name: HUNG_GAINS[k % len(HUNG_GAINS)] for k, e in enumerate(drawn)}
@@ -120,7 +120,7 @@ def record_hung(hidden: Hidden, name: str, seed: int, count: int, seconds: float
 
 
 def record_for_net(hidden: Hidden, name: str, seed: int, count: int, seconds: float) -> list[Recording]:
-    """Return ``count`` more recordings of the hung robot, all different and with the gains of the walk."""
+    """Return ``count`` more recordings of the suspended robot, all different and with the gains of the walk."""
     rng = _rng(name, seed, 3)
     drawn = cases.experiment(FOR_NETS, count + 1, seconds, rng)
     return _hung(hidden, [_with_gains(e, KP, KD) for e in drawn[:-1]], rng)

@@ -1,4 +1,4 @@
-"""The benchmark's own excitations of a hung robot: targets (T, J) in rad, and whether the drives are on (T,).
+"""The benchmark's own excitations of a suspended robot: targets (T, J) in rad, and whether the drives are on (T,).
 
 They resemble what a user records, and are not those that the solver's package makes.
 """

@@ -58,7 +58,7 @@ class Samples:
 
 
 def build(truth: Truth, dt: float) -> mujoco.MjModel:
-    """Compile the hung robot: joints only, friction and damping none, since they are computed outside."""
+    """Compile the suspended robot: joints only, friction and damping none, since they are computed outside."""
     spec = mujoco.MjSpec.from_file(str(data_root() / "assets/go1/go1.xml"))
     spec.delete(spec.joint("root"))
     for geom in list(spec.geoms):

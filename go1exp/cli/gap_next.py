@@ -190,7 +190,7 @@ def _loop(container: dict[str, Any]) -> int:
     if not isinstance(parts["model"], Go1Model):
         problems.append("model: the simulated robot is a Go1; only model.tolerances can be changed here")
     if settings.support != "suspended":
-        problems.append(f"support = {settings.support!r}: designs are for a robot that is hung")
+        problems.append(f"support = {settings.support!r}: designs are for a suspended robot")
     if any(m.entry.traits.get("closed_loop") for m in parts["excitation"]):
         problems.append("excitation: motions only; a policy or a controller walks on the ground")
     if problems:

@@ -16,7 +16,7 @@ from go1exp.gap.data.windows import Splits, Windows, splits, stretches
 from go1exp.gap.replay.replayer import LEVEL
 from go1exp.gap.result import DEFAULT_CLOCK, Clock, ClockChoice, Floors, GapSettings
 from go1exp.gap.robots.fixed_base import FixedBase
-from go1exp.gap.robots.go1 import hung
+from go1exp.gap.robots.go1 import suspended
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score.initial_state import measured, repeatability
 from go1exp.gap.score.likelihood import Scorer
@@ -105,8 +105,8 @@ class Comparison:
 
 
 def robot_from(robot: RobotConfig | Robot) -> Robot:
-    """Return a robot; from its configuration a Go1, hung."""
-    return hung(robot) if isinstance(robot, RobotConfig) else robot
+    """Return a robot; from its configuration a Go1, suspended."""
+    return suspended(robot) if isinstance(robot, RobotConfig) else robot
 
 
 def prepare(recordings: Sequence[Recording], robot: Robot, settings: GapSettings) -> tuple[Robot, Ready]:

@@ -1,4 +1,4 @@
-"""Windows of legs in swing: a leg in the air is a hung leg on a trunk that moves as the IMU says.
+"""Windows of legs in swing: a leg in the air is a suspended leg on a trunk that moves as the IMU says.
 
 While its foot is in the air, a leg feels the ground only through the motion of the trunk, which the IMU measures: the
 specific force and the rate of turn, in the trunk's own axes, are all that the leg's motion depends on. So nothing about

@@ -78,27 +78,27 @@ def beside(joints: np.ndarray, series: np.ndarray, at: np.ndarray) -> np.ndarray
 
 @dataclass
 class StandingReplayer(Replayer):
-    """Replays windows of a robot on its feet, and those of the same robot hung.
+    """Replays windows of a robot on its feet, and those of the same robot suspended.
 
     Attributes:
         held: the same robot with its trunk held.
-        hung: replays its windows; made where there are some.
+        suspended: replays its windows; made where there are some.
     """
 
     windows: StandingWindows
     held: Machine = field(kw_only=True)
-    hung: Replayer | None = None
+    suspended: Replayer | None = None
 
     def run(self, rows: Rows, dt: float) -> np.ndarray:
         """Return what sensors would measure (R, n, 3, J) at the windows' sample times; 0 where nothing is compared."""
         held = self.windows.held[rows.window]
         if not held.any():
             return super().run(rows, dt)
-        if self.hung is None:
-            self.hung = Replayer(self.held, self.windows, self.quats, self.max_rows, self.threads)
-        self.hung.windows = self.windows.plain()
+        if self.suspended is None:
+            self.suspended = Replayer(self.held, self.windows, self.quats, self.max_rows, self.threads)
+        self.suspended.windows = self.windows.plain()
         y = np.zeros((len(held), self.windows.t.shape[1], len(self.windows.quantities), len(self.windows.joints)))
-        y[held, :, :2] = self.hung.run(rows.part(np.flatnonzero(held)), dt)
+        y[held, :, :2] = self.suspended.run(rows.part(np.flatnonzero(held)), dt)
         if not held.all():
             y[~held] = super().run(rows.part(np.flatnonzero(~held)), dt)
         return y

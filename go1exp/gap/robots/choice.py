@@ -6,7 +6,7 @@ from go1exp.config.schema.physics import ContactConfig
 from go1exp.config.schema.registry import ConfigError
 from go1exp.gap.robots.description import Go1Model, ModelConfig
 from go1exp.gap.robots.fixed_base import FixedBase
-from go1exp.gap.robots.go1 import hung
+from go1exp.gap.robots.go1 import suspended
 from go1exp.gap.robots.protocol import Robot
 from go1exp.robot.config import RobotConfig
 from go1exp.sim.effects.tolerances import Tolerances
@@ -15,7 +15,7 @@ from go1exp.sim.effects.tolerances import Tolerances
 def robot_of(
     model: ModelConfig | Go1Model, config: RobotConfig, path: str = "model", contact: ContactConfig | None = None
 ) -> Robot:
-    """Return the robot of a description; the Go1 is ``config``, hung.
+    """Return the robot of a description; the Go1 is ``config``, suspended.
 
     Args:
         model: the description.
@@ -27,7 +27,7 @@ def robot_of(
         ConfigError: with what its MuJoCo file lacks, naming the key; or if a contact was chosen for a fixed base.
     """
     if isinstance(model, Go1Model):
-        return hung(config, Tolerances.from_effects(model.tolerances), contact)
+        return suspended(config, Tolerances.from_effects(model.tolerances), contact)
     if contact is not None:
         raise ConfigError(
             [f"contact: is of the feet of a Go1; {path} is a robot on a fixed base, and it would do nothing"]

@@ -184,7 +184,7 @@ LEGS = tuple(tuple(range(3 * leg, 3 * leg + 3)) for leg in range(robot.NUM_LEGS)
 
 
 @dataclass(frozen=True)
-class HungGo1(Go1):
+class SuspendedGo1(Go1):
     """A Go1 whose trunk is held, so that its legs do not feel each other.
 
     Attributes:
@@ -253,6 +253,6 @@ class HungGo1(Go1):
         return Replayer(self, windows, quats, max_rows, threads)
 
 
-def hung(config: RobotConfig, tolerances: Tolerances = DECLARED, contact: ContactConfig | None = None) -> Robot:
+def suspended(config: RobotConfig, tolerances: Tolerances = DECLARED, contact: ContactConfig | None = None) -> Robot:
     """Return a Go1 whose trunk is held; on its feet it has ``contact``, or the one that recordings name."""
-    return HungGo1(config, tolerances=tolerances, contact=contact)
+    return SuspendedGo1(config, tolerances=tolerances, contact=contact)

@@ -20,7 +20,7 @@ class Robot(Machine, Protocol):
     """A robot that can be replayed, and that knows which recordings can be compared with it, and how."""
 
     def suited(self, recordings: Sequence[Recording], phase: Phase = "whole") -> Robot:
-        """Return the robot as it is in these recordings: hung, on its feet, or its legs while they are in the air."""
+        """Return the robot as it is in these recordings: suspended, standing, or its legs while they are in the air."""
 
     def flaws(self, recording: Recording, report: AuditReport) -> list[str]:
         """Return why a recording cannot be compared with this robot, a line each."""

@@ -23,7 +23,7 @@ from go1exp.gap.files import CALIBRATION, COMPENSATING, EFFECT, GapFileError
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
 from go1exp.gap.robots.fixed_base import FixedBase
-from go1exp.gap.robots.go1 import HungGo1
+from go1exp.gap.robots.go1 import SuspendedGo1
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score.likelihood import excess, removed
 from go1exp.gap.search.fit import scores
@@ -284,7 +284,7 @@ def read_as(robot: Robot, result: GapResult) -> Robot:
     Raises:
         GapFileError: if another contact is chosen now, or the model says now what the search was to compare.
     """
-    if isinstance(robot, HungGo1) and result.contact is not None:
+    if isinstance(robot, SuspendedGo1) and result.contact is not None:
         if robot.contact is not None:
             _same_contact(Tolerances(contact=robot.contact), tolerances_of(result))
         return replace(robot, contact=result.contact)
