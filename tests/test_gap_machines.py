@@ -31,8 +31,7 @@ from go1exp.gap.robots.fixed_base import FixedBase
 from go1exp.gap.robots.go1 import SuspendedGo1
 from go1exp.gap.search import tolerances
 from go1exp.gap.search.certainty import resampled_values
-from go1exp.gap.search.ledger import LastCheck
-from go1exp.gap.search.search import begun
+from go1exp.gap.search.search import LastCheck, begun
 from go1exp.gap.stages.explain import explain
 from go1exp.logs.importers import import_recordings
 from go1exp.logs.recording import Meta, Recording, joint_channel
