@@ -201,6 +201,12 @@ def test_two_files_whose_paths_differ_by_a_sign_are_two(tmp_path: Path, monkeypa
     ("words", "status", "said"),
     [
         ("train word", 2, "go1exp train: word: not a setting, which is key=value; see go1exp train --help"),
+        (
+            "train -m seed=1,2 ppo.gama=2",
+            2,
+            "go1exp train: ppo.gama=2: no such key 'ppo.gama'; did you mean 'ppo.gamma'",
+        ),
+        ("train -m +seed=1", 2, "+seed=1: 'seed' exists already; leave out the plus: 'seed=1'"),
         ("train -m --cfg job seed=1,2", 2, "go1exp train: -m and --cfg cannot be used together: --cfg and --info show"),
         ("eval --foo", 2, "go1exp eval: --foo: unknown option; see go1exp eval --help"),
         ("list reward rand", 2, "go1exp list: rand: not a setting, which is key=value; see go1exp list --help"),

@@ -101,10 +101,10 @@ class App:
         print(f"{name}: {message}", file=sys.stderr, flush=True)
         return status
 
-    def cause(self, error: Exception) -> str:
+    def cause(self, error: Exception, overrides: Sequence[str] = ()) -> str:
         """Return what went wrong in one line, whatever it was."""
         try:
-            message = self._explain(error, ())[1]
+            message = self._explain(error, overrides)[1]
         except Exception:  # a bug: its kind says more than its message
             message = f"{type(error).__name__}: {error}"
         return " ".join(message.split())

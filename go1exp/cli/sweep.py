@@ -144,7 +144,7 @@ def _checked(
     names = [job.name for job in planned]
     show = spinner(len(planned), "checking jobs")
     for number, job in enumerate(planned):
-        with _noting(app, problems, number):
+        with _noting(app, problems, number, job.overrides):
             ours = [o for o in job.overrides if not re.match(r"[+~]*hydra[./@]", o)]
             container = compose(app.name, ours, folders)
             if container.get("resume") or container.get("sweep"):
@@ -165,12 +165,12 @@ def _checked(
 
 
 @contextmanager
-def _noting(app: App, problems: dict[str, list[int]], number: int) -> Iterator[None]:
+def _noting(app: App, problems: dict[str, list[int]], number: int, overrides: Sequence[str] = ()) -> Iterator[None]:
     """Collect what is wrong with a job."""
     try:
         yield
     except Exception as error:
-        for line in error.problems if isinstance(error, ConfigError) else [app.cause(error)]:
+        for line in error.problems if isinstance(error, ConfigError) else [app.cause(error, overrides)]:
             problems.setdefault(line, []).append(number)
 
 

@@ -70,7 +70,11 @@ def compose_checked(name: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
 def composition_problem(
     error: Exception, name: str, overrides: Sequence[str], folders: Sequence[Path] = ()
 ) -> str | None:
-    """Return why ``overrides`` of ``conf/<name>.yaml`` were refused, in one line; None if they were not."""
+    """Return why ``overrides`` of ``conf/<name>.yaml`` were refused, in one line; None if they were not.
+
+    Options among the overrides, such as ``-m``, are left out.
+    """
+    overrides = [o for o in overrides if not o.startswith("-") and ("=" in o or o.startswith("~"))]
     why = hydra_adapter.refusal(error, name, as_hydra_takes_them(overrides), folders)
     if why is None:
         return None
