@@ -27,9 +27,10 @@ import numpy as np
 import torch
 
 from go1exp.base.paths import data_root
-from go1exp.gap.actuator_net import FitResult, FitSettings, fit
 from go1exp.gap.actuator_net.dataset import windows
+from go1exp.gap.actuator_net.fitting import FitResult, fit
 from go1exp.gap.actuator_net.report import rmse
+from go1exp.gap.actuator_net.settings import FitSettings
 from go1exp.logs.importers import import_recordings
 from go1exp.logs.recording import Recording
 

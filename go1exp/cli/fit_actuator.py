@@ -43,9 +43,9 @@ GO1 = "go1"
 
 
 def _inverse_dynamics(config: RobotConfig, smoothing: float | None) -> Callable[[Recording], np.ndarray]:
-    """Return the function from a recording of a hung Go1 to the torques (T, 12) at its joints, N m."""
-    from go1exp.gap.actuator_net import FitError, smooth_motion
-    from go1exp.gap.actuator_net.dataset import WINDOW
+    """Return the function from a recording of a suspended Go1 to the torques (T, 12) at its joints, N m."""
+    from go1exp.gap.actuator_net.dataset import WINDOW, smooth_motion
+    from go1exp.gap.actuator_net.settings import FitError
     from go1exp.sim.physics.dynamics import joint_torques
 
     def joint_torque(recording: Recording) -> np.ndarray:
@@ -79,7 +79,7 @@ def _task(container: dict[str, Any]) -> None:
 
     settings, parts = parse_with_groups(FitActuatorSettings, container, ("robot",))
 
-    from go1exp.gap import actuator_net as fit
+    from go1exp.gap.actuator_net import fitting, plots, report
 
     recordings = _with_gains(read_all(settings.recordings), settings.gains)
     existed = Path(settings.out).exists()
@@ -97,7 +97,7 @@ def _task(container: dict[str, Any]) -> None:
         print("note: smoothing=0.02 usually serves target=joint_torque better (docs/actuator_nets.md)")
     inverse = _inverse_dynamics(parts["robot"], settings.smoothing) if settings.target == "joint_torque" else None
     try:
-        result = fit.fit(recordings, subset(fit.FitSettings, settings), progress, inverse)
+        result = fitting.fit(recordings, subset(FitSettings, settings), progress, inverse)
     except BaseException:  # refused, or stopped: what was made here and holds nothing goes
         if not existed:
             remove_empty(out)
@@ -105,8 +105,8 @@ def _task(container: dict[str, Any]) -> None:
     result.net.save(out / "net.npz")
     result.net.export_onnx(out / "net.onnx")
     write_json(out / "report.json", result.report.as_dict())
-    pictures = fit.plot(result, out) if settings.plots else []
-    print(fit.text(result.report))
+    pictures = plots.plot(result, out) if settings.plots else []
+    print(report.text(result.report))
     print(f"\nwritten to {out}: net.npz, net.onnx, report.json{''.join(f', {p.name}' for p in pictures)}")
     print(f"now: {command('train', 'actuator=net', settings={'actuator.file': out / 'net.npz'})}")
 

@@ -13,7 +13,8 @@ import numpy as np
 from go1exp.config.schema.registry import Term, members
 from go1exp.evaluate.bench.env import core_subject
 from go1exp.evaluate.bench.measure import rates, ratio
-from go1exp.gap.actuator_net import FitSettings, fit
+from go1exp.gap.actuator_net.fitting import fit
+from go1exp.gap.actuator_net.settings import FitSettings
 from go1exp.logs import recording
 from go1exp.logs.record import plan, simulate
 from go1exp.logs.record.sensors import SensorConfig

@@ -1,6 +1,6 @@
 """Physical effects that a nominal model lacks. Importing the package registers every effect."""
 
-from go1exp.sim.effects import (
+from go1exp.sim.effects import (  # noqa: F401
     armature,
     base_tilt,
     cogging,
@@ -28,32 +28,3 @@ from go1exp.sim.effects import (
     strength_drift,
     torque_speed_limit,
 )
-
-__all__ = [
-    "armature",
-    "base_tilt",
-    "cogging",
-    "com_offset",
-    "dead_band",
-    "delays",
-    "encoder_offset",
-    "external_wrench",
-    "fixed_point",
-    "foot_friction",
-    "friction",
-    "gears",
-    "ground_compliance",
-    "joint_stop",
-    "kd_scale",
-    "kp_scale",
-    "lag",
-    "link_com",
-    "link_inertia",
-    "link_mass",
-    "parallel_stiffness",
-    "point_masses",
-    "soft_mount",
-    "strength",
-    "strength_drift",
-    "torque_speed_limit",
-]
