@@ -550,7 +550,7 @@ def test_an_order_of_three_joints_is_named() -> None:
     report = audit(with_(sound, **turned))
     orders = {f.channel: f.message for f in report.by_check("order")}
     assert set(orders) == {f"q_target_{a}" for a in leg}
-    assert "what is called FR_hip is the joint it drives" in orders["q_target_FR_thigh"]
+    assert "what is called FR_hip is the joint it moves" in orders["q_target_FR_thigh"]
 
 
 def test_speeds_of_swapped_joints_are_named() -> None:
