@@ -252,6 +252,13 @@ CASES = [
     Case("load_clock", "a fall through the air", {**QUARTER, "foot_force": [0.0] * 4}, 0.0),
     Case("load_clock", "another rate", {**QUARTER, "foot_force": feet(FL=60.0)}, math.sqrt(0.5), {"rate": 1.25}),
     Case("load_clock", "nothing without a command", {"episode_time": 0.1, "foot_force": feet(FL=60.0)}, 0.0),
+    Case("diagonal_load", "standing feet", {**QUARTER, "foot_force": [30.0] * 4}, 0.0),
+    Case("diagonal_load", "one diagonal", {**QUARTER, "foot_force": feet(FL=60.0, RR=70.0)}, 1.0),
+    Case("diagonal_load", "the other diagonal", {**QUARTER, "foot_force": feet(FR=60.0, RL=70.0)}, 1.0),
+    Case("diagonal_load", "three quarters", {**QUARTER, "foot_force": [10.0, 30.0, 30.0, 10.0]}, 0.5),
+    Case("diagonal_load", "a side, as in a pace", {**QUARTER, "foot_force": feet(FR=60.0, RR=60.0)}, 0.0),
+    Case("diagonal_load", "a fall through the air", {**QUARTER, "foot_force": [0.0] * 4}, 0.0),
+    Case("diagonal_load", "no command", {"command": [0.0] * 3, "foot_force": feet(FL=60.0)}, 0.0),
     Case("foot_clearance", "standing", {}, 1.0),
     Case(
         "foot_clearance",
