@@ -64,6 +64,15 @@ def test_a_ramp_is_the_line_between_its_ends_in_steps_of_all_robots(tmp_path: Pa
     assert [float(row["schedule/d_low"]) for row in log] == [0.0] * 6
 
 
+def test_a_ramp_may_count_iterations() -> None:
+    _, schedule = built(ramp(f"{WEIGHT}, start: 2, over: 4, unit: iterations"))
+    values = []
+    for iteration in range(8):
+        schedule.advance(iteration * STEPS, {})
+        values.append(schedule.metrics()["schedule/x"])
+    assert values == [1.0, 1.0, 1.0, 1.5, 2.0, 2.5, 3.0, 3.0]
+
+
 @pytest.mark.parametrize(
     ("path", "value", "overrides"),
     [

@@ -45,8 +45,9 @@ def groups_of(verb: str) -> dict[str, str | None]:
             for group, choice in item.items():
                 name = str(group).removeprefix("override ")
                 if name == str(group) or name in FOLDERS:  # Hydra's own groups are ours where they have a folder
-                    chosen[name] = choice
-    return chosen
+                    chosen[name.removeprefix("optional ")] = choice
+    # A choice may follow that of another group: ppo: ${backend}.
+    return {name: chosen.get(str(choice).strip("${}"), choice) for name, choice in chosen.items()}
 
 
 def folder_of(group: str, folder: Path) -> Path:

@@ -140,8 +140,7 @@ def diagonal_load(s: Snapshot) -> Tensor:
     """Reward weight on one diagonal at a time: |F_FR + F_RL - F_FL - F_RR| / sum_i F_i, in [0, 1].
 
     F are the forces on the feet, N. 0 for standing feet, 1 in the stance phases of a trot; 0 while no motion is
-    commanded. Shifting weight is rewarded before a foot leaves the ground, without a clock: where ``trot`` is flat, this
-    is not. Not in Table III.
+    commanded. Shifting weight is rewarded before a foot leaves the ground, where ``trot`` is flat. Not in Table III.
     """
     sign = constant_like(DIAGONAL_SIGNS, s.foot_force)
     share = (s.foot_force * sign).sum(-1).abs() / s.foot_force.sum(-1).clamp(min=1.0)

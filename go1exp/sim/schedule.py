@@ -7,8 +7,9 @@ A name of the group is one ramp (``config/schema/training.py``)::
     delay: {set: actuator.command, from: [0.0, 0.0], to: [0.0, 0.03], start: 40e6, over: 20e6}
     stiff: {set: contact.time_constant, from: 0.02, to: 0.005, when: {measure: gait/trot_error, below: 0.1}, over: 20e6}
 
-``start`` and ``over`` count steps of all robots together since the run began. The values in the groups ``reward``,
-``actuator`` and ``contact`` are those of a run without the schedule, and those with which the policy is evaluated.
+``start`` and ``over`` count steps of all robots together since the run began, or iterations (``unit``). The values in
+the groups ``reward``, ``actuator`` and ``contact`` are those of a run without the schedule, and those with which the
+policy is evaluated.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ WEIGHT = "weight"
 FEET_CONTACT_FIELD = "geom_solref"
 """Model field that holds the time constant of the feet's contacts."""
 
-KEYS = ("set", "from", "to", "start", "over", "when")
+KEYS = ("set", "from", "to", "start", "over", "when", "unit")
 
 
 def parse(settings: Any, parts: Mapping[str, Any]) -> tuple[dict[str, Ramp], list[str]]:

@@ -34,8 +34,17 @@ class Schedule:
     threshold. Together with those steps, the recent values of the metrics are the state that a checkpoint holds.
     """
 
-    def __init__(self, ramps: Mapping[str, Ramp] | None = None, core: Go1Core | None = None) -> None:
-        """Put the first values into force in ``core``, which was built with ``changing`` of the same settings."""
+    def __init__(
+        self, ramps: Mapping[str, Ramp] | None = None, core: Go1Core | None = None, per_iteration: int = 1
+    ) -> None:
+        """Put the first values into force.
+
+        Args:
+            ramps: by name.
+            core: environment, which was built with ``changing`` of the same settings.
+            per_iteration: steps of all robots together in an iteration.
+        """
+        self._per_iteration = per_iteration
         self._ramps, self._core = dict(ramps or {}), core
         self._triggers = {key: ramp.when for key, ramp in self._ramps.items() if ramp.when}
         self._recent = {key: deque[float](maxlen=trigger.iterations) for key, trigger in self._triggers.items()}
@@ -72,8 +81,9 @@ class Schedule:
     def _apply(self, steps: int) -> None:
         """Write the values at ``steps`` into the environment, those that differ from the present ones."""
         for key, ramp in self._ramps.items():
-            start = self._started[key] if key in self._triggers else ramp.start or 0.0
-            value = ramp.value(-math.inf if start is None else steps - start)
+            per = self._per_iteration if ramp.unit == "iterations" else 1
+            start = self._started[key] if key in self._triggers else per * (ramp.start or 0.0)
+            value = ramp.value(-math.inf if start is None else (steps - start) / per)
             if self._core is not None and self._values.get(key) != value:
                 self._core.change(ramp.path, value)
             self._values[key] = value

@@ -259,9 +259,10 @@ class Ramp:
         set: key of the setting, such as reward.touchdown_speed.weight, actuator.command or contact.time_constant.
         from: value before the ramp.
         to: value after it.
-        start: steps of all robots together after which the ramp starts; 0 without when.
-        over: steps of all robots together that the ramp takes; 0 is a jump.
+        start: time after which the ramp starts, in unit; 0 without when.
+        over: time that the ramp takes, in unit; 0 is a jump.
         when: start at a metric's threshold instead, {measure, below or above, iterations}.
+        unit: steps of all robots together, or iterations, which suit small and large batches alike.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
@@ -272,6 +273,7 @@ class Ramp:
     over: NonNegative
     start: NonNegative | None = None
     when: Trigger | None = None
+    unit: Literal["steps", "iterations"] = "steps"
 
     def __post_init__(self) -> None:
         """Check what concerns two settings."""
@@ -280,13 +282,13 @@ class Ramp:
         if isinstance(self.first, tuple) != isinstance(self.last, tuple):
             raise ValueError("to: must have as many numbers as from")
 
-    def value(self, steps_since_start: float) -> Value:
-        """Return the value some steps after the ramp's start; negative before it."""
-        if steps_since_start < 0.0:
+    def value(self, since_start: float) -> Value:
+        """Return the value some time, in ``unit``, after the ramp's start; negative before it."""
+        if since_start < 0.0:
             return self.first
-        if steps_since_start >= self.over:
+        if since_start >= self.over:
             return self.last
-        share = steps_since_start / self.over
+        share = since_start / self.over
         if isinstance(self.first, tuple) and isinstance(self.last, tuple):
             low, high = (a + share * (b - a) for a, b in zip(self.first, self.last, strict=True))
             return low, high
