@@ -368,7 +368,7 @@ def test_a_term_that_remembers_gives_a_robot_the_same_alone_and_in_a_batch() -> 
 
 def test_an_observation_that_remembers_cannot_be_exported_and_that_is_said() -> None:
     core = remembering()
-    with pytest.raises(ExportError, match=r"observation\.memory_of_speed: remembers the past"):
+    with pytest.raises(ExportError, match=r"observation\.memory_of_speed: has a memory"):
         required_inputs(core.task.observation)
 
 

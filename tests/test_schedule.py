@@ -16,7 +16,10 @@ from go1exp.config.schema.registry import ConfigError
 from go1exp.sim.task import parse_train
 from go1exp.train import checkpoint, preflight, trainer
 from go1exp.train.schedule import Schedule
-from tests.test_resume import FLAT, SIX, assert_the_same_run, rows, train_here
+from tests import test_resume
+from tests.test_resume import SIX, assert_the_same_run, rows, train_here
+
+FLAT = (*test_resume.FLAT, "reward=paper_literal", "schedule=none")
 
 STEPS = 64
 """Of all robots together in an iteration of ``FLAT``."""
@@ -64,6 +67,15 @@ def test_a_ramp_is_the_line_between_its_ends_in_steps_of_all_robots(tmp_path: Pa
     assert [float(row["schedule/d_low"]) for row in log] == [0.0] * 6
 
 
+def test_a_ramp_without_an_end_leads_to_the_configured_value() -> None:
+    delay = "set: actuator.command, from: [0.0, 0.0], over: 100"
+    contact = "set: contact.time_constant, from: 0.02, over: 100"
+    ramps = [ramp("set: reward.gait.weight, from: 1.0, over: 100"), ramp(delay, "d"), ramp(contact, "c")]
+    settings = ["reward.gait.weight=7.0", "actuator=delay", "actuator.command=[0.01,0.02]", "contact=stiff"]
+    schedule = train_config(*settings, *ramps).schedule
+    assert {key: of_key.last for key, of_key in schedule.items()} == {"x": 7.0, "d": (0.01, 0.02), "c": 0.005}
+
+
 def test_a_ramp_may_count_iterations() -> None:
     _, schedule = built(ramp(f"{WEIGHT}, start: 2, over: 4, unit: iterations"))
     values = []
@@ -79,7 +91,7 @@ def test_a_ramp_may_count_iterations() -> None:
         ("reward.gait.weight", 3.0, ()),
         ("reward.touchdown_speed.weight", -20.0, ("+reward.touchdown_speed={weight: 0.0}",)),
         ("reward.linear_velocity_error.scale", 0.25, ()),
-        ("reward.gait.full_cycle", 0.35, ("reward=paper_trot",)),
+        ("reward.gait.full_cycle", 0.2, ("reward=paper",)),
         ("actuator.command", [0.02, 0.02], ("actuator=delay",)),
         ("contact.time_constant", 0.005, ()),
     ],

@@ -14,6 +14,7 @@ policy is evaluated.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -39,8 +40,10 @@ def parse(settings: Any, parts: Mapping[str, Any]) -> tuple[dict[str, Ramp], lis
     ramps: dict[str, Ramp] = {}
     problems: list[str] = []
     for key, given in settings.items():
+        if given is None:  # taken away, as an ablation does
+            continue
         try:
-            ramps[str(key)] = TypeAdapter(Ramp).validate_json(as_json(given))
+            ramps[str(key)] = _with_end(TypeAdapter(Ramp).validate_json(as_json(given)), parts)
         except ValidationError as error:
             problems += explain(error, f"schedule.{key}", KEYS)
     setters: dict[str, str] = {}
@@ -50,6 +53,21 @@ def parse(settings: Any, parts: Mapping[str, Any]) -> tuple[dict[str, Ramp], lis
         setters[ramp.path] = key
         problems += _target_problems(f"schedule.{key}", ramp, parts)
     return ramps, problems
+
+
+def _with_end(ramp: Ramp, parts: Mapping[str, Any]) -> Ramp:
+    """Return the ramp with the configured value at its end if it names none, and as it is if its setting is unknown."""
+    if ramp.last is not None or ramp.path not in changeable(parts):
+        return ramp
+    if ramp.path == CONTACT_TIME:
+        value: Value = parts["contact"].time_constant
+    elif ramp.path == DELAY:
+        value = parts["actuator"].parameters["command"]
+    else:
+        key, _, name = ramp.path.removeprefix("reward.").rpartition(".")
+        term = next(t for t in parts["reward"] if t.key == key)
+        value = float(term.slots[WEIGHT] if name == WEIGHT else term.parameters[name])
+    return dataclasses.replace(ramp, last=value)
 
 
 def changeable(parts: Mapping[str, Any]) -> list[str]:
@@ -78,6 +96,7 @@ def _target_problems(path: str, ramp: Ramp, parts: Mapping[str, Any]) -> list[st
             return [f"{path}.set = {DELAY!r}: needs actuator=delay"]
         return [unknown_name(f"{path}.set", ramp.path, known, "setting")]
     problems = []
+    assert ramp.last is not None
     for end, value in (("from", ramp.first), ("to", ramp.last)):
         of_value = _value_problems(f"{path}.{end}", ramp.path, value, parts)
         problems += of_value[:1]

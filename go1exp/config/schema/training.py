@@ -258,7 +258,7 @@ class Ramp:
     Attributes:
         set: key of the setting, such as reward.touchdown_speed.weight, actuator.command or contact.time_constant.
         from: value before the ramp.
-        to: value after it.
+        to: value after it; without it the configured one.
         start: time after which the ramp starts, in unit; 0 without when.
         over: time that the ramp takes, in unit; 0 is a jump.
         when: start at a metric's threshold instead, {measure, below or above, iterations}.
@@ -269,8 +269,8 @@ class Ramp:
 
     path: Annotated[str, Field(alias="set")]
     first: Annotated[Value, Field(alias="from")]
-    last: Annotated[Value, Field(alias="to")]
     over: NonNegative
+    last: Annotated[Value | None, Field(alias="to")] = None
     start: NonNegative | None = None
     when: Trigger | None = None
     unit: Literal["steps", "iterations"] = "steps"
@@ -279,11 +279,12 @@ class Ramp:
         """Check what concerns two settings."""
         if self.start is not None and self.when is not None:
             raise ValueError("when: start has no meaning beside it; give one of the two")
-        if isinstance(self.first, tuple) != isinstance(self.last, tuple):
+        if self.last is not None and isinstance(self.first, tuple) != isinstance(self.last, tuple):
             raise ValueError("to: must have as many numbers as from")
 
     def value(self, since_start: float) -> Value:
         """Return the value some time, in ``unit``, after the ramp's start; negative before it."""
+        assert self.last is not None
         if since_start < 0.0:
             return self.first
         if since_start >= self.over:
