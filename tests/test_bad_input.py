@@ -220,7 +220,7 @@ def test_two_files_whose_paths_differ_by_a_sign_are_two(tmp_path: Path, monkeypa
         ("gap logs=.", 1, "go1exp gap: .: no *.parquet in it"),
         ("export check .", 1, "go1exp export check: Is a directory: ."),
         ("deploy nowhere.zip", 1, "go1exp deploy: No such file or directory: nowhere.zip"),
-        ("deploy x.zip feet=f.json", 2, "feet = f.json: calibrates sensors that report counts; those of robot=sim report newtons"),
+        ("deploy x.zip feet=f.json", 2, "feet = f.json: calibrates sensors that report counts; those of robot=sim"),
         ("deploy walk.zip robot=sm", 2, "go1exp deploy: robot = 'sm': input should be 'sim' or 'go1'"),
         (
             "train reward=shrt",

@@ -330,15 +330,15 @@ def test_terms_that_remember_are_called_once_a_step_and_forget_where_an_episode_
     first = core.reset().clone()
     assert not first[:, -2:].any()
     parts = core.terms.parts()
-    assert list(parts) == ["reward.slow_power", "termination.wild", "observation.memory_of_speed"]
+    assert list(parts) == ["reward.gait", "reward.slow_power", "termination.wild", "observation.memory_of_speed"]
     core.terms.frames.noise.zero_()
     for step in range(1, 8):
         result = core.step(torch.full((3, 12), 0.5 * (-1) ** step))
         final, observed = result.final_observation[:, -1], result.observation[:, -1]
         assert final.tolist() == [float(1 + (step - 1) % 5)] * 3  # an episode has five steps
         assert observed.tolist() == [float(step % 5)] * 3
-        for part in parts.values():
-            assert part.calls.tolist() == observed.tolist()
+        for name in set(parts) - {"reward.gait"}:  # which counts nothing
+            assert parts[name].calls.tolist() == observed.tolist()
 
 
 def test_terms_that_remember_continue_from_a_saved_state_bit_for_bit() -> None:

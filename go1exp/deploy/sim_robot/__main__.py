@@ -30,7 +30,7 @@ from go1exp.sim.effects.rules import actuator_problems
 from go1exp.sim.task import TaskConfig, parse_parts, parse_train
 
 WITHOUT_POLICY: dict[str, Any] = {
-    **{group: {} for group in ("reward", "rand", "event", "termination", "curriculum")},
+    **{group: {} for group in ("reward", "rand", "event", "termination", "curriculum", "schedule")},
     "observation": {"joint_position": {}},
     "command": {"term": "fixed_velocity"},
     "plugins": [],

@@ -131,10 +131,10 @@ def _overlays(result: GapResult) -> Section:
         f" model{', and the measurements of the IMU' if trunk else ''}. Small panels: model - measurement in standard"
         " deviations of the noise, linear up to 3 and logarithmic beyond; the grey band is ± 2."
     )
-    more = len(result.overlays) - len(windows)
+    hidden = len(result.overlays) - len(windows)
     title, rest = (
         "Nominal and fitted model on held-out windows",
-        [Block(f"{more} more in report.json.")] if more else [],
+        [Block(f"{hidden} more in report.json.")] if more else [],
     )
     blocks: Content = [*drawn, *rest] if drawn else [Block("No curves were kept.")]
     return Section(title, blocks, note if drawn else "", "overlays")

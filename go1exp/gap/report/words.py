@@ -138,9 +138,9 @@ def sizes(named: NamedEffect) -> list[tuple[str, str, str]]:
         if not len(values) or not is_size(named.effect, name):
             continue
         widths = [0.5 * (b - a) for a, b in named.interval.get(name, {}).values()]
-        half, of = number(float(np.mean(widths)) if widths else math.nan, 2), unit(named.effect, name)
-        mean = f"{number(float(values.mean()))} ± {half} {of}".rstrip()
-        spread = f"{number(float(values.min()))} to {number(float(values.max()))} {of}".rstrip()
+        half, in_unit = number(float(np.mean(widths)) if widths else math.nan, 2), unit(named.effect, name)
+        mean = f"{number(float(values.mean()))} ± {half} {in_unit}".rstrip()
+        spread = f"{number(float(values.min()))} to {number(float(values.max()))} {in_unit}".rstrip()
         rows.append((name, mean, f"{spread} over {len(values)} joints" if len(values) > 1 else ""))
     return rows
 
