@@ -134,7 +134,7 @@ def _overlays(result: GapResult) -> Section:
     hidden = len(result.overlays) - len(windows)
     title, rest = (
         "Nominal and fitted model on held-out windows",
-        [Block(f"{hidden} more in report.json.")] if more else [],
+        [Block(f"{hidden} more in report.json.")] if hidden else [],
     )
     blocks: Content = [*drawn, *rest] if drawn else [Block("No curves were kept.")]
     return Section(title, blocks, note if drawn else "", "overlays")
