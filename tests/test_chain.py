@@ -27,7 +27,10 @@ from tests.small_run import SMALL
 STEP = 0.002
 """Training's and the robot's, s."""
 
-LIVELY = ("ppo.learning_rate=0.03", "ppo.learning_rate_range=[0.03,0.03]", "actuator.kp=35", "actuator.kd=0.7")
+LIVELY = (
+    *("ppo.learning_rate=0.03", "ppo.learning_rate_range=[0.03,0.03]", "action.scale=0.35"),
+    *("actuator.kp=35", "actuator.kd=0.7"),
+)
 """A policy of two iterations that moves the legs a little."""
 
 TORQUE, SPEED, ANGLE = 0.2, 0.25, 0.006

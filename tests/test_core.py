@@ -378,7 +378,7 @@ def test_a_new_command_is_seen_before_it_is_paid_for(make_task: Callable[..., Ta
         final = result["final_observation"]
         assert torch.equal(final[:, 9:12], seen[:, 9:12])
         error = (seen[:, 9:11] - final[:, :2]).norm(dim=1)
-        np.testing.assert_allclose(result["reward"], 0.1 * torch.exp(-error), rtol=1e-5)
+        np.testing.assert_allclose(result["reward"], 0.02 * tracking.slots["weight"] * torch.exp(-error), rtol=1e-5)
         assert torch.equal(result["observation"][:, 9:12], core.command.value)
         changes += int((result["observation"][:, 9:12] != seen[:, 9:12]).any(1).sum())
         seen = result["observation"]
@@ -561,7 +561,7 @@ def test_the_reward_is_weight_times_term_times_period_summed_over_terms(make_tas
 
 
 def test_the_reward_is_the_sum_of_the_configured_terms_on_the_snapshot_of_the_step(make_core: Make) -> None:
-    core = make_core(*QUIET, num_envs=4, noise=False)
+    core = make_core(*QUIET, "reward=paper_literal", num_envs=4, noise=False)
     core.reset()
     weights = {t.key: t.slots["weight"] for t in core.task.reward}
     assert len(weights) == 19

@@ -245,7 +245,7 @@ def test_a_term_of_the_critic_may_remember_and_its_memory_is_saved(tmp_path: Pat
     file = tmp_path / "my_terms.py"
     file.write_text(MEMORY)
     with plugins.restored():
-        task = settings(f"plugins=[{file}]", "+critic.last_command={}").task
+        task = settings(f"plugins=[{file}]", "+critic.last_command={}", "ppo.symmetry=false").task
         core = Go1Core(task, 4, critic=True)
         core.reset()
         for _ in range(3):

@@ -179,10 +179,11 @@ EXEMPT = {
 """Leaf, or mapping of leaves, that need not be shown to act, and the reason."""
 
 NEEDS = {
+    "reward/paper": ["schedule=none"],  # which sets three of its weights
     "curriculum/terrain_level": ["terrain=rough"],
     "critic/terrain": ["terrain=rough"],
     "experiment/trot": [  # it changes what these say
-        *("observation=clock", "reward=clock", "ppo=gpu", "command=widening", "actuator=delay"),
+        *("observation=clock", "reward=clock", "ppo=warp", "command=widening", "actuator=delay"),
         "observation.gait_clock.rate=3.1",  # neither the file's nor the experiment's, which the rewards take over
     ],
     "experiment/five_minutes": ["reward=clock"],
@@ -194,7 +195,7 @@ NEEDS = {
     "experiment/study_cpu": ["experiment=study", "backend=cpu", "ppo=small"],
     "experiment/robust": ["experiment=trot", "backend=cpu"],
     "experiment/robust_history": ["experiment=robust", "backend=cpu"],
-    "experiment/paper_trot": ["reward=paper_trot", "command=widening", "actuator=delay", "ppo=gpu"],
+    "experiment/paper_trot": ["reward=paper_trot", "command=widening", "actuator=delay", "ppo=warp"],
     "experiment/reference_second": ["experiment=reference", "backend=cpu"],  # it changes what that one adds
 }
 """Choices that other choices must go with."""
@@ -907,7 +908,8 @@ def verb_trace(container: dict[str, Any], walk: Walk) -> Trace:
         patch.setattr(sys, "argv", sys.argv)
         patch.setenv("HYDRA_FULL_ERROR", "0")  # the verb changes both
         patch.setattr(trainer, "train", noted)
-        assert APP.run([f"hydra.run.dir={walk.folder() / 'new'}", *chosen]) == 0
+        # with the network of policy=hop
+        assert APP.run(["ppo=paper", f"hydra.run.dir={walk.folder() / 'new'}", *chosen]) == 0
     yield "folder", folders
 
 

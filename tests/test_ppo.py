@@ -203,7 +203,7 @@ class Watched:
 @pytest.fixture(scope="module")
 def adaptive() -> tuple[AdaptivePPO, Watched]:
     """Twelve iterations with a goal that the rate has to look for in both directions."""
-    ppo = slider_ppo("ppo.epochs=3", "ppo.minibatches=4", "ppo.desired_kl=0.003")
+    ppo = slider_ppo("ppo.schedule=adaptive", "ppo.epochs=3", "ppo.minibatches=4", "ppo.desired_kl=0.003")
     watched = Watched(ppo)
     learn(ppo, 12)
     return ppo, watched

@@ -20,7 +20,7 @@ from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.base.tensors.rotation import projected_gravity, rotate_inverse
 from go1exp.config.schema.training import Value
 from go1exp.mdp.actions import clipped, joint_target, of_shape
-from go1exp.mdp.commands import UniformVelocity
+from go1exp.mdp.commands import UniformVelocity, WideningVelocity
 from go1exp.mdp.feet import Feet
 from go1exp.mdp.ground import GroundHeight, HeightScan
 from go1exp.mdp.kinematics import KinematicState, lift
@@ -180,6 +180,8 @@ class Go1Core:
     def reseed(self, seed: int) -> None:
         """Make the next ``reset`` the first one of an environment built with ``seed``."""
         self.random.reseed(seed)
+        if isinstance(self.command, WideningVelocity):
+            self.command.age.zero_()
         self._started = False
 
     def _randomize_model(self, when: str, mask: Tensor) -> None:
