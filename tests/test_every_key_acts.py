@@ -908,8 +908,8 @@ def verb_trace(container: dict[str, Any], walk: Walk) -> Trace:
         patch.setattr(sys, "argv", sys.argv)
         patch.setenv("HYDRA_FULL_ERROR", "0")  # the verb changes both
         patch.setattr(trainer, "train", noted)
-        # with the network of policy=hop
-        assert APP.run(["ppo=paper", f"hydra.run.dir={walk.folder() / 'new'}", *chosen]) == 0
+        fitting = ["ppo=paper"] if container["start_from"] else []  # the network of policy=hop
+        assert APP.run([*fitting, f"hydra.run.dir={walk.folder() / 'new'}", *chosen]) == 0
     yield "folder", folders
 
 
