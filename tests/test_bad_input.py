@@ -211,6 +211,11 @@ def test_two_files_whose_paths_differ_by_a_sign_are_two(tmp_path: Path, monkeypa
         ("eval --foo", 2, "go1exp eval: --foo: unknown option; see go1exp eval --help"),
         ("list reward rand", 2, "go1exp list: rand: not a setting, which is key=value; see go1exp list --help"),
         ("train --config-dir nowhere reward=x", 2, "no such folder"),
+        (
+            "train schedule=papr",
+            2,
+            "go1exp train: schedule=papr: unknown choice of schedule 'papr'; did you mean 'paper'?",
+        ),
         ("eval reward=paper", 2, "go1exp eval: reward=paper: no such key 'reward'; see --help"),
         ("eval policy=papr", 2, "go1exp eval: policy: unknown shipped policy 'papr'; did you mean 'paper'?"),
         ("eval run=.", 2, "go1exp eval: run = '.': not a run folder (it has no config.yaml)"),

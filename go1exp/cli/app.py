@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 import shutil
 import sys
 import traceback
@@ -17,12 +18,12 @@ from typing import Any, TypeVar
 import go1exp.cli.hydra_main as hydra_main
 from go1exp.cli.hydra_main import choices_from_files
 from go1exp.cli.verbs import FLAGS, MODULES, VALUED, protected
-from go1exp.config.choices import CONFIG_DIR, given_folders
+from go1exp.config.choices import CONFIG_DIR, choice_files, config_folder, given_folders
 from go1exp.config.compose import as_hydra_takes_them, composition_problem
 from go1exp.config.hydra_adapter import REFUSED
 from go1exp.config.schema import plugins
 from go1exp.config.schema import settings as schema
-from go1exp.config.schema.registry import ConfigError, Expected
+from go1exp.config.schema.registry import ConfigError, Expected, unknown_name
 
 BAD_CONFIG, FAILED = 2, 1
 """Exit statuses: configuration refused before anything was built; the work failed. What a signal ended has
@@ -70,6 +71,7 @@ class App:
         try:
             _refuse_stray_words(arguments, title)
             overrides, folders = _without_config_dir(choices_from_files(arguments, self.name))
+            _refuse_unknown_schedule(overrides, folders)
             argv = [title, *map(protected, as_hydra_takes_them(overrides))]
             sweep = self.sweep
             on_sweep = None if sweep is None else lambda asked: sweep(self, folders, asked)
@@ -154,6 +156,15 @@ def _refuse_stray_words(arguments: Sequence[str], title: str) -> None:
         problems.append(f"{' and '.join(modes)} cannot be used together: --cfg and --info show one run, without -m")
     if problems:
         raise ConfigError(problems)
+
+
+def _refuse_unknown_schedule(overrides: Sequence[str], folders: Sequence[Path]) -> None:
+    """Raise ConfigError if a chosen schedule has no file; Hydra ignores that, as the group is optional."""
+    for chosen in (o.partition("=")[2] for o in overrides if o.lstrip("+").startswith("schedule=")):
+        known = choice_files("schedule", [config_folder(), *folders])
+        unknown = [name for name in chosen.split(",") if name not in known and re.fullmatch(r"[\w/]+", name)]
+        if unknown:
+            raise ConfigError([unknown_name(f"schedule={unknown[0]}", unknown[0], known, "choice of schedule")])
 
 
 def _without_config_dir(arguments: Sequence[str]) -> tuple[list[str], list[Path]]:
