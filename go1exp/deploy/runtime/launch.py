@@ -103,7 +103,7 @@ class SimulatedRobot:
         self.pid = self._process.pid
 
     def _answer(self, patience: float) -> dict[str, Any]:
-        """Return the next line of the process as JSON; empty if there is none in time."""
+        """Return the next line of the process as JSON; empty if there is none in time, or only part of one."""
         assert self._process.stdout is not None
         until, text = time.monotonic() + patience, b""
         while not text.endswith(b"\n"):
@@ -114,7 +114,10 @@ class SimulatedRobot:
             if not part:
                 return {}
             text += part
-        answer: dict[str, Any] = json.loads(text)
+        try:
+            answer: dict[str, Any] = json.loads(text)
+        except ValueError:  # a process that was killed while it wrote
+            return {}
         return answer
 
     def close(self) -> None:
