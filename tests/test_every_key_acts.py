@@ -106,6 +106,8 @@ EXEMPT = {
     "backend/warp.yaml:backend": "needs a GPU and an extra: tests/contracts/test_backends.py",
     "controller/mpc.yaml:controller": "tests/test_controller.py shows what each key does",
     "controller/policy.yaml:controller": "the name of the choice",
+    "experiment/ablation/no_action_smoothness.yaml:schedule.smooth": "a ramp that is taken away with its row",
+    "experiment/ablation/no_smoothness.yaml:schedule.smooth": "the same",
     "reward/paper_literal.yaml:reward.air_time_variance.weight": "as printed, the term is zero for every gait",
     **{
         f"launcher/{file.stem}.yaml:launcher": "needs several cores, or a cluster: tests/test_sweeps.py, test_slurm.py"
@@ -179,6 +181,10 @@ EXEMPT = {
 """Leaf, or mapping of leaves, that need not be shown to act, and the reason."""
 
 NEEDS = {
+    **{
+        f"experiment/{name}": ["schedule=none"]  # which sets the weight of action_smoothness
+        for name in ("ablation/no_action_smoothness", "ablation/no_smoothness", "five_minutes_part/no_smoothness")
+    },
     "reward/paper": ["schedule=none"],  # which sets three of its weights
     "curriculum/terrain_level": ["terrain=rough"],
     "critic/terrain": ["terrain=rough"],
@@ -196,7 +202,6 @@ NEEDS = {
     "experiment/robust": ["experiment=trot", "backend=cpu"],
     "experiment/robust_history": ["experiment=robust", "backend=cpu"],
     "experiment/paper_trot": ["reward=paper_trot", "command=widening", "actuator=delay", "ppo=warp"],
-    "experiment/reference_second": ["experiment=reference", "backend=cpu"],  # it changes what that one adds
 }
 """Choices that other choices must go with."""
 
