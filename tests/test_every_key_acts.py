@@ -1369,6 +1369,7 @@ def test_dead_keys_are_found(walk: Walk, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setitem(registry._REGISTRY["reward"], "ghost", registry.Entry("reward", "ghost", ghost))
     before = walk.setup(Leaf("train", "", None))
     before["reward"] = {"ghost": {"weight": 1.0, "used": 1.0, "unused": 1.0, "half": [0.0, 1.0]}}
+    before["schedule"] = {}  # whose rows are those of reward=paper
     for key, dead in {"weight": [], "used": [], "unused": ["unused"], "half": ["half[0]"]}.items():
         path = f"reward.ghost.{key}"
         found = walk.idle("train", before, path, variants("train", before, path, walk))
