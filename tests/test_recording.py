@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import pickle
@@ -340,6 +341,20 @@ def test_an_extension_column_is_refused_whether_pyarrow_knows_its_type_or_not(pa
     finally:
         pa.unregister_extension_type("go1exp.test.foreign")
     refused(path, "q_elbow: is of an extension type")
+
+
+def test_pickled_objects_are_refused_unread(path: Path) -> None:
+    bombs = pa.array([pickle.dumps(print)] * 50, pa.binary())
+    refused(plant(path, {**arm().channels, "q_elbow": bombs}), "q_elbow: is stored as byte_array")
+
+
+def test_nothing_here_can_unpickle() -> None:
+    source = ast.parse(Path(rec.__file__).read_text())
+    names = {a.name for n in ast.walk(source) if isinstance(n, ast.Import) for a in n.names}
+    names |= {n.module or "" for n in ast.walk(source) if isinstance(n, ast.ImportFrom)}
+    assert not names & {"pickle", "cloudpickle", "dill", "marshal", "shelve", "joblib", "torch", "pandas"}
+    called = {n.attr for n in ast.walk(source) if isinstance(n, ast.Attribute)}
+    assert not called & {"load", "loads", "read_pickle", "deserialize"}
 
 
 def test_two_columns_of_one_name_are_refused(path: Path) -> None:
