@@ -386,7 +386,7 @@ def test_table_2_has_the_printed_sizes_and_noise_in_order(paper: TrainConfig) ->
 def test_section_2_commands_pushes_terrain_and_actions(paper: TrainConfig) -> None:
     task = paper.task
     velocities = {"lin_vel_x": (-2.0, 3.0), "lin_vel_y": (-1.5, 1.5), "ang_vel_z": (-1.5, 1.5)}
-    fractions = {"standing_fraction": 0.1, "zero_fraction": 0.0, "hard_share": 1.0}
+    fractions = {"standing_fraction": 0.1, "zero_fraction": 0.0, "slow_fraction": 0.0, "hard_share": 1.0}
     assert task.command.parameters == {**velocities, "hold_time": (0.3, 10.0), **fractions}
     (push,) = task.event
     assert (push.key, push.parameters) == ("push", {"interval": (10.0, 15.0), "velocity": (-1.0, 1.0)})

@@ -13,6 +13,9 @@ from go1exp.config.schema.registry import Fraction, Positive, PositiveRange, Spe
 if TYPE_CHECKING:
     from torch import Tensor
 
+SLOW = 0.2
+"""Share of the ranges that slow commands are drawn from."""
+
 
 @command("uniform_velocity")
 class UniformVelocity(Memory):
@@ -33,6 +36,7 @@ class UniformVelocity(Memory):
         hold_time: PositiveRange = (0.3, 10.0),
         standing_fraction: Fraction = 0.1,
         zero_fraction: Fraction = 0.0,
+        slow_fraction: Fraction = 0.0,
         hard_share: Fraction = 1.0,
     ) -> None:
         """Keep the ranges (m/s, m/s, rad/s, s).
@@ -46,6 +50,8 @@ class UniformVelocity(Memory):
             standing_fraction: share of the commands that are exactly zero.
             zero_fraction: probability that an axis of another command is zero, each axis by itself: without it a
                 pure command along one axis is rare.
+            slow_fraction: share of the commands whose axes are all drawn from a fifth of their ranges: without it these
+                are 1 in 125, and a robot that is commanded 0.2 m/s stands still.
             hard_share: share of the ranges on the hardest tiles of a height field, from 1 on flat ones; linear in
                 difficulty. Source: go2_rl_gym.
         """
@@ -53,6 +59,7 @@ class UniformVelocity(Memory):
         ranges = torch.tensor([lin_vel_x, lin_vel_y, ang_vel_z, hold_time], device=device)
         self._low, self._high = ranges.unbind(1)
         self._standing_fraction, self._zero_fraction = standing_fraction, zero_fraction
+        self._slow_fraction = slow_fraction
         self._hard_share, self._stream = hard_share, stream
         self.value = torch.zeros(len(stream.key), 3, device=device)
         self.time_left = torch.zeros(len(stream.key), device=device)
@@ -65,6 +72,8 @@ class UniformVelocity(Memory):
         asked = self._stream.uniform(1) >= self._standing_fraction
         if self._zero_fraction:
             asked = asked & (self._stream.uniform(3) >= self._zero_fraction)
+        if self._slow_fraction:
+            asked = asked * torch.where(self._stream.uniform(1) < self._slow_fraction, SLOW, 1.0)
         self.value.copy_(torch.where(due.unsqueeze(1), draw[:, :3] * asked * self._in_force(), self.value))
         self.time_left.copy_(torch.where(due, draw[:, 3], self.time_left))
 
@@ -101,6 +110,7 @@ class WideningVelocity(UniformVelocity):
         hold_time: PositiveRange = (0.3, 10.0),
         standing_fraction: Fraction = 0.1,
         zero_fraction: Fraction = 0.0,
+        slow_fraction: Fraction = 0.0,
         hard_share: Fraction = 1.0,
     ) -> None:
         """Keep the ranges; velocities are drawn from the share ``start`` of them first, from all after ``over`` s."""
@@ -112,6 +122,7 @@ class WideningVelocity(UniformVelocity):
             hold_time=hold_time,
             standing_fraction=standing_fraction,
             zero_fraction=zero_fraction,
+            slow_fraction=slow_fraction,
             hard_share=hard_share,
         )
         self._start, self._over = start, over

@@ -374,6 +374,18 @@ def test_uniform_velocities_fill_their_ranges_and_a_tenth_stand_still() -> None:
     assert command.time_left.max() <= 10.0
 
 
+def test_slow_commands_and_commands_along_one_axis_have_their_shares() -> None:
+    n = 20_000
+    command = members("command")["uniform_velocity"].target(
+        stream(n), standing_fraction=0.0, slow_fraction=0.25, zero_fraction=0.1
+    )
+    command.advance(DT, everyone(n))
+    fifth = torch.tensor([[-0.4, 0.6], [-0.3, 0.3], [-0.3, 0.3]])
+    slow = ((command.value >= fifth[:, 0]) & (command.value <= fifth[:, 1])).all(1)
+    assert slow.float().mean() == pytest.approx(0.25 + 0.75 * (0.1 + 0.9 * 0.2) ** 3, abs=0.015)
+    np.testing.assert_allclose((command.value == 0.0).float().mean(0), [0.1, 0.1, 0.1], atol=0.01)
+
+
 def test_uniform_velocities_are_held_for_a_time_within_the_range_and_change_for_one_robot_at_a_time() -> None:
     n, steps, hold = 40, 300, (0.3, 1.0)
     command = members("command")["uniform_velocity"].target(stream(n), hold_time=hold, standing_fraction=0.0)
