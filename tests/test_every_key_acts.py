@@ -21,6 +21,7 @@ import types
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager, redirect_stdout, suppress
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from fnmatch import fnmatchcase
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -75,110 +76,58 @@ Trace = Generator[tuple[str, Any], None, None]
 Two traces are run in turns: while one waits, it has changed nothing that the other could see.
 """
 
-REPORT = (
-    *("folders", "baseline", "curves", "figures", "correction", "paired", "unfinished", "eval", "evaluation", "points"),
-    *("wandb", "project", "folder", "plugins", "hydra"),
-)
-
-COMPARE = ("subjects", "same_robot", "seed", "physics_dt", "folder", "plugins", "hydra")
-
-TUNE = (
-    *(
-        "space",
-        "overrides",
-        "trials",
-        "workers",
-        "metric",
-        "direction",
-        "average",
-        "warmup",
-        "prune",
-        "storage",
-        "seed",
-    ),
-    *("out", "plugins"),
-)
-
 EXEMPT = {
+    "*.yaml:hydra": "Hydra's own settings",
+    "*.yaml:plugins": "tests/test_plugins.py shows what it does",
     "backend/cpu.yaml:backend.name": "the other engine is an extra: tests/contracts/test_backends.py",
     "engine/mujoco.yaml:engine": "backend/cpu.yaml has the same keys; tests/test_physx.py shows the other engine",
     "engine/physx.yaml:engine": "needs an extra: tests/test_physx.py shows what each key does",
     "backend/warp.yaml:backend": "needs a GPU and an extra: tests/contracts/test_backends.py",
     "controller/mpc.yaml:controller": "tests/test_controller.py shows what each key does",
     "controller/policy.yaml:controller": "the name of the choice",
-    "experiment/ablation/no_action_smoothness.yaml:schedule.smooth": "a ramp that is taken away with its row",
-    "experiment/ablation/no_smoothness.yaml:schedule.smooth": "the same",
+    "experiment/ablation/no*_smoothness.yaml:schedule.smooth": "a ramp that is taken away with its row",
     "reward/paper_literal.yaml:reward.air_time_variance.weight": "as printed, the term is zero for every gait",
-    **{
-        f"launcher/{file.stem}.yaml:launcher": "needs several cores, or a cluster: tests/test_sweeps.py, test_slurm.py"
-        for file in (CONF / "launcher").glob("*.yaml")
-    },
-    **{
-        f"study/{file.stem}.yaml:study": "jobs of a sweep: tests/test_configs.py" for file in (CONF / "study").iterdir()
-    },
-    **{
-        f"schedule/{file.stem}.yaml:schedule": "ramps over millions of steps: tests/test_schedule.py shows each key"
-        for file in (CONF / "schedule").glob("*.yaml")
-        if file.stem != "none"
-    },
+    "launcher/*.yaml:launcher": "needs several cores, or a cluster: tests/test_sweeps.py, test_slurm.py",
+    "study/*.yaml:study": "jobs of a sweep: tests/test_configs.py",
+    "schedule/*.yaml:schedule": "ramps over millions of steps: tests/test_schedule.py shows each key",
     "actuator/net_simulated.yaml:actuator.period": "actuator/net.yaml has the same key",
     "train.yaml:sweep": "tests/test_sweeps.py shows what it does",
-    "tune.yaml:hydra": "Hydra's own settings",
-    **{f"tune.yaml:{key}": "needs an extra: tests/test_tune.py" for key in TUNE},
-    **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("train", "eval", "play", "list", "bench")},
-    **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("record", "record_audit", "record_import")},
-    **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("fit-actuator", "gap", "export", "export_check")},
-    **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("deploy", "sim")},
-    **{f"deploy.yaml:{key}": "of a robot that hangs: tests/test_played.py" for key in ("motion", "gains")},
-    **{f"deploy.yaml:{key}": "of robot=go1: tests/test_go1_walk.py" for key in ("address", "check")},
-    "deploy.yaml:feet": "of sensors that count: tests/test_go1_walk.py",
     "logger/wandb.yaml:logger.wandb.tags": "tests/test_logging.py reads them back",
-    **{f"report.yaml:{key}": "tests/test_report.py shows what it does" for key in REPORT},
-    **{f"train.yaml:{key}": "tests/test_asynchronous.py shows what it does" for key in ("eval", "video", "stop")},
-    **{f"play.yaml:{key}": "tests/test_viewer_keys.py" for key in ("host", "port", "log")},
-    **{f"sim.yaml:{key}": "of its page: tests/test_viewer_keys.py" for key in ("viewer", "host", "port")},
-    "gap.yaml:search.phase": "of robots that walk: tests/test_gap_swings.py shows what it does",
-    **{f"gap.yaml:{key}": "of the stage view: tests/test_viewer_keys.py" for key in ("host", "port")},
-    "play.yaml:bundle": "in place of run, as of eval: tests/test_viewer_keys.py",
-    **{
-        f"gap_next.yaml:{key}": "tests/test_gap_next.py shows what it does"
-        for key in ("logs", "out", "design", "plugins", "hydra")
-    },
-    **{
-        f"gap_loop.yaml:{key}": "as of record.yaml, gap.yaml and gap_next.yaml; tests/test_gap_loop.py shows the rest"
-        for key in (
-            *("effect", "excitation", "gains", "seconds", "seeds", "repeats", "support", "hang", "physics_dt", "seed"),
-            *("rounds", "sensors", "search", "design", "out", "plugins", "hydra"),
-        )
-    },
-    **{f"compare.yaml:{key}": "tests/test_protocol_commands.py shows what it does" for key in COMPARE},
-    **{f"eval.yaml:{key}": "not of the grid: tests/test_protocol_commands.py" for key in ("bundle", "folder")},
-    **{
-        f"protocol/{file.stem}.yaml:protocol": "tests/test_protocols.py shows that each key is read"
-        for file in (CONF / "protocol").glob("*.yaml")
-    },
-    **{
-        f"{verb}.yaml:plugins": "tests/test_plugins.py shows what it does"
-        for verb in (
-            "train",
-            "eval",
-            "play",
-            "record",
-            "record_import",
-            "fit-actuator",
-            "gap",
-            "export",
-            "list",
-            "bench",
-        )
-    },
+    "protocol/*.yaml:protocol": "tests/test_protocols.py shows that each key is read",
     "model/go1.yaml:model": "the Go1 is that of the group robot; test_gap_tolerances.py shows what its tolerances do",
     **{
         f"model/{name}.yaml:model": "a robot that is not simulated here; test_gap_machines.py shows what its keys do"
         for name in ("go2", "xl330_pendulum", "ak80_double_pendulum_a", "ak80_double_pendulum_c", "so101")
     },
+    **{
+        f"{verb}.yaml:{key}": reason
+        for verb, keys, reason in (
+            (
+                "tune",
+                "space overrides trials workers metric direction average warmup prune storage seed out",
+                "test_tune",
+            ),
+            ("deploy", "motion gains", "of a suspended robot: test_played"),
+            ("deploy", "address check", "of robot=go1: test_go1_walk"),
+            ("deploy", "feet", "of sensors that count: test_go1_walk"),
+            ("report", "folders baseline curves figures correction paired unfinished eval evaluation", "test_report"),
+            ("report", "points wandb project folder", "test_report"),
+            ("train", "eval video stop", "test_asynchronous"),
+            ("play", "host port log", "test_viewer_keys"),
+            ("play", "bundle", "in place of run, as of eval: test_viewer_keys"),
+            ("sim", "viewer host port", "of its page: test_viewer_keys"),
+            ("gap", "search.phase", "of robots that walk: test_gap_swings"),
+            ("gap", "host port", "of the stage view: test_viewer_keys"),
+            ("gap_next", "logs out design", "test_gap_next"),
+            ("gap_loop", "effect excitation gains seconds seeds repeats support hang physics_dt seed", "record.yaml"),
+            ("gap_loop", "rounds sensors search design out", "gap.yaml, gap_next.yaml, test_gap_loop"),
+            ("compare", "subjects same_robot seed physics_dt folder", "test_protocol_commands"),
+            ("eval", "bundle folder", "not of the grid: test_protocol_commands"),
+        )
+        for key in keys.split()
+    },
 }
-"""Leaf, or mapping of leaves, that need not be shown to act, and the reason."""
+"""Leaf, or mapping of leaves, that need not be shown to act (``*`` as in file names), and the reason or test."""
 
 NEEDS = {
     **{
@@ -406,15 +355,19 @@ def read_leaves(conf: Path = CONF) -> list[Leaf]:
     return found
 
 
+def covers(entry: str, name: str) -> bool:
+    return fnmatchcase(name, entry) or fnmatchcase(name, f"{entry}.*")
+
+
 def exemption(name: str) -> str | None:
     """The entry of ``EXEMPT`` that covers a leaf."""
-    return next((e for e in EXEMPT if name == e or name.startswith(f"{e}.")), None)
+    return next((e for e in EXEMPT if covers(e, name)), None)
 
 
 def stale(exempt: Iterable[str], names: Iterable[str]) -> list[str]:
     """Exemptions that no leaf needs any more."""
     names = list(names)
-    return [e for e in exempt if not any(n == e or n.startswith(f"{e}.") for n in names)]
+    return [e for e in exempt if not any(covers(e, n) for n in names)]
 
 
 LEAVES = read_leaves()
@@ -438,29 +391,20 @@ def has(container: Mapping[str, Any], key: str) -> bool:
     return True
 
 
-def _opened(container: dict[str, Any], parents: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """A copy in which the mapping at ``parents`` can be changed, and that mapping; what is beside it is shared."""
-    changed = dict(container)
-    node = changed
-    for part in parents:
-        node[part] = dict(node[part])
-        node = node[part]
-    return changed, node
+ABSENT = object()
 
 
 def put(container: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
-    """A copy with another value."""
+    """A copy with another value, or without the key where that is ABSENT; what is beside it is shared."""
     *parents, last = key.split(".")
-    changed, node = _opened(container, parents)
-    node[last] = value
-    return changed
-
-
-def drop(container: dict[str, Any], key: str) -> dict[str, Any]:
-    """A copy without the key."""
-    *parents, last = key.split(".")
-    changed, node = _opened(container, parents)
-    del node[last]
+    changed = node = dict(container)
+    for part in parents:
+        node[part] = dict(node[part])
+        node = node[part]
+    if value is ABSENT:
+        del node[last]
+    else:
+        node[last] = value
     return changed
 
 
@@ -563,7 +507,7 @@ def variants(program: str, container: dict[str, Any], key: str, walk: Walk) -> d
     if key == "policy":  # in place of a run
         return {key: [put(put(container, "run", None), key, "paper")]}
     if value == {}:
-        return {key: [drop(container, key)]}
+        return {key: [put(container, key, ABSENT)]}
     if key.endswith(".term") and key.split(".")[0] in (*MANY_TERMS, *ONE_TERM):
         return {key: list(with_other_term(container, key))}
     if isinstance(value, list):
@@ -685,11 +629,8 @@ class Walk:
         if leaf.program in ("eval", "play", "export"):
             return [f"run={self.trained('run')}"]
         if leaf.program == "record":
-            walk = (
-                ["excitation=[policy]", f"run={self.trained('run')}"]
-                if leaf.key in ("run", "policy", "episodes")
-                else []
-            )
+            needed = leaf.key in ("run", "policy", "episodes")
+            walk = ["excitation=[policy]", f"run={self.trained('run')}"] if needed else []
             stand = ["support=ground"] if leaf.key == "sensors.truth" else []  # a held trunk does not move
             return ["backend.threads=1", *walk, *stand]
         if leaf.program == "record_audit":
