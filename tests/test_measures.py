@@ -12,8 +12,6 @@ from go1exp import robot
 from go1exp.config.schema.registry import members
 from go1exp.evaluate.statistics.intervals import mean_interval, phase_interval, share_interval
 from go1exp.extend.testing.traces import random_trace, without
-from go1exp.logs.recorded import hysteresis, trace_of
-from go1exp.logs.recording import Meta, Recording, RecordingError
 from go1exp.mdp.measures import every_measure, measured
 from go1exp.mdp.measures.trace import NotMeasured, Trace, find_runs, largest_within, settled
 
@@ -340,82 +338,6 @@ def test_the_largest_value_of_a_stretch_may_be_its_last_and_the_record_s_last() 
     values = np.array([[1.0, 5.0, 2.0], [7.0, 0.0, 9.0]])
     column, start, stop = np.array([0, 1, 0]), np.array([0, 1, 2]), np.array([2, 3, 3])
     assert largest_within(values, column, start, stop).tolist() == [5.0, 9.0, 2.0]
-
-
-# ---------------------------------------------------------------------- a real robot's recording
-
-
-def recording(seconds: float = 4.0, rate: float = 500.0) -> Recording:
-    """A trot with noisy forces, of which q and the trunk's true velocity are not known."""
-    t = np.arange(round(seconds * rate)) / rate
-    turn = (2.5 * t[:, None] - np.array(PATTERNS["trot"]) + 1e-9) % 1.0
-    force = np.where(turn < 0.5, 60.0, 2.0) + np.random.default_rng(0).normal(0.0, 1.0, (len(t), 4))
-    channels = {"t": t, **{f"foot_force_{leg}": force[:, k] for k, leg in enumerate(robot.LEGS)}}
-    channels |= {f"imu_quat_{a}": np.full(len(t), v) for a, v in zip("wxyz", (1.0, 0.0, 0.0, 0.0), strict=True)}
-    meta = Meta(
-        robot="go1",
-        joints=robot.JOINTS,
-        rate_hz=rate,
-        base="floating",
-        base_quat=None,
-        kp=None,
-        kd=None,
-        tau_limit=None,
-        excitation=None,
-        episode="walk",
-        repeat_of=None,
-        source="measured",
-        tool="",
-        versions={},
-        notes="",
-    )
-    return Recording(meta, channels)
-
-
-def test_a_recording_without_true_velocity_is_measured_as_far_as_it_goes() -> None:
-    values = {name: v for name, v in measured(trace_of(recording(), mass=12.7)).items() if v is not None}
-    assert values["gait"].tolist() == ["trot"]
-    assert values["stride_rate"][0] == pytest.approx(2.5, rel=1e-3)
-    assert values["trunk_pitch"][0] == pytest.approx(0.0)
-    np.testing.assert_allclose(values["load_share"][0], 0.25, atol=0.01)
-    missing = {"heave", "trunk_height", "cost_of_transport", "clearance", "slip_share", "touchdown_speed_p95"}
-    assert not missing & set(values)
-
-
-def test_a_recording_s_true_velocity_is_turned_into_the_trunk_s_frame() -> None:
-    log = recording()
-    rows, half = len(log.t), np.sqrt(0.5)
-    quat = zip("wxyz", (half, 0.0, 0.0, half), strict=True)  # heading along the world's y
-    log.channels.update({f"base_quat_{a}": np.full(rows, v) for a, v in quat})
-    log.channels.update({f"base_lin_vel_{a}_w": np.full(rows, v) for a, v in zip("xyz", (-0.2, 1.0, 0.1), strict=True)})
-    velocity = trace_of(log).base_lin_vel_b
-    assert velocity is not None
-    np.testing.assert_allclose(velocity[0, 0], [1.0, 0.2, 0.1], atol=1e-12)
-
-
-def test_a_force_between_the_thresholds_changes_nothing() -> None:
-    force = np.array([12, 19, 20, 15, 11, 9, 15, 25, 10, 5])[:, None]
-    assert hysteresis(force, 20.0, 10.0)[:, 0].tolist() == [
-        False,
-        False,
-        True,
-        True,
-        True,
-        False,
-        False,
-        True,
-        True,
-        False,
-    ]
-
-
-def test_a_recording_without_foot_forces_is_refused_by_name() -> None:
-    log = recording()
-    del log.channels["foot_force_RR"]
-    with pytest.raises(RecordingError, match="walk: no channel 'foot_force_RR'"):
-        trace_of(log)
-    with pytest.raises(ValueError, match="contact_off = 30"):
-        trace_of(recording(), contact_off=30.0)
 
 
 # ---------------------------------------------------------------------- intervals

@@ -35,8 +35,8 @@ from go1exp.gap.search.fit import stacked
 from go1exp.gap.stages.explain import explain
 from go1exp.logs.recording import read_folder
 from go1exp.sim.effects.rules import on_mount
-from go1exp.sim.effects.soft_mount import SoftMount
 from go1exp.sim.effects.tolerances import DECLARED
+from go1exp.sim.effects.trunk import SoftMount
 from go1exp.sim.env.plant import Plant, actuator_setup
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu
 from go1exp.sim.physics.scene import build_model

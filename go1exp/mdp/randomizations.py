@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 JOINT_POS_LIMITS = tuple(tuple(bound) for bound in robot.JOINT_POS_LIMITS.T.tolist())
 """Lower and upper, rad."""
 
-FEET = tuple(f"{leg}_foot" for leg in robot.LEGS)
 Operation = Literal["set", "add", "scale"]
 """``set``: the draw itself; ``add``: nominal + draw; ``scale``: nominal x draw."""
 
@@ -54,8 +53,8 @@ def foot_friction(
     operation: Literal["set", "scale"] = "set",
 ) -> None:
     """Sliding friction coefficient of each foot; the foot's value is the contact's. Table I: new, (0.4, 1.1)."""
-    draw = stream.uniform(len(FEET), low=range[0], high=range[1])
-    _vary(model, "geom_friction", (model.ids("geom", FEET), 0), mask, operation, draw)
+    draw = stream.uniform(len(robot.FEET), low=range[0], high=range[1])
+    _vary(model, "geom_friction", (model.ids("geom", robot.FEET), 0), mask, operation, draw)
 
 
 Restitution = Annotated[float, Field(ge=0.02, le=0.7)]
@@ -70,14 +69,14 @@ FEET_CONTACT = "contact of the feet"
 
 def _set_contact(model: ModelFields, mask: Tensor, time: Tensor, ratio: Tensor) -> None:
     """Set each foot's spring: 1 / its natural frequency, s, and its damping ratio; (N, 4) or (N, 1)."""
-    feet = model.ids("geom", FEET)
+    feet = model.ids("geom", robot.FEET)
     _vary(model, "geom_solref", (feet, 0), mask, "set", time / ratio)
     _vary(model, "geom_solref", (feet, 1), mask, "set", ratio)
 
 
 def _spring(model: ModelFields) -> tuple[Tensor, Tensor]:
     """Return the feet's nominal spring (1 or N, 4): 1 / its natural frequency, s, and its damping ratio."""
-    time, ratio = model.nominal("geom_solref")[:, model.ids("geom", FEET)].unbind(-1)
+    time, ratio = model.nominal("geom_solref")[:, model.ids("geom", robot.FEET)].unbind(-1)
     return time * ratio, ratio
 
 
@@ -95,7 +94,7 @@ def foot_restitution(
     takes on the way out: at 1 m/s and a time constant of 5 ms 0.3 comes out as 0.25, 0.2 as 0.1 (docs/contact.md).
     Text of the paper, section II-B.1, which prints no range: 0.1 to 0.3 is chosen.
     """
-    ratio = damping_ratio(stream.uniform(len(FEET), low=range[0], high=range[1]))
+    ratio = damping_ratio(stream.uniform(len(robot.FEET), low=range[0], high=range[1]))
     _set_contact(model, mask, _spring(model)[0], ratio)
 
 
@@ -116,7 +115,7 @@ def ground_stiffness(
     time = stream.uniform(1, low=range[0], high=range[1])
     ratio = _spring(model)[1]
     if restitution is not None:
-        ratio = damping_ratio(stream.uniform(len(FEET), low=restitution[0], high=restitution[1]))
+        ratio = damping_ratio(stream.uniform(len(robot.FEET), low=restitution[0], high=restitution[1]))
     _set_contact(model, mask, time, ratio)
 
 

@@ -18,6 +18,9 @@ JOINTS = tuple(f"{leg}_{kind}" for leg in LEGS for kind in JOINT_KINDS)
 GRAVITY = 9.81
 """m/s2; MuJoCo's own, and what is taken for it on a robot."""
 
+FEET = tuple(f"{leg}_foot" for leg in LEGS)
+"""Names of the foot spheres, and of the sites at their centres."""
+
 NUM_JOINTS = len(JOINTS)
 NUM_LEGS = len(LEGS)
 

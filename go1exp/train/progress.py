@@ -22,12 +22,10 @@ class Progress:
         self._bar: Any = None
         self._task: Any = None
         if sys.stderr.isatty():
-            try:
-                from rich.console import Console
-                from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
-                from rich.progress import Progress as Bar
-            except ImportError:
-                return
+            from rich.console import Console
+            from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+            from rich.progress import Progress as Bar
+
             self._bar = Bar(
                 TextColumn("{task.completed:.0f}/{task.total:.0f}"),
                 BarColumn(bar_width=20),

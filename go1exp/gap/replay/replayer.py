@@ -108,7 +108,7 @@ class Replayer:
         if effects.rotors:
             effects.rotors.twist.copy_(twist)
         for target in past:  # what a delayed command remembers
-            effects.on_target(target)
+            effects.through("on_target", target)
         for effect in effects.effects.values():
             effect.elapse(torch.as_tensor(w.elapsed[rows.window]))
 

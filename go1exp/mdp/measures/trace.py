@@ -102,8 +102,8 @@ class NotMeasured(ValueError):
 class Trace:
     """N robots over T steps and S >= T samples of contact, S a multiple of T; a column that was not measured is None.
 
-    Joints and legs are in the order of ``robot.py``. Of a simulated robot a step is a policy step and a sample a
-    physics step; of a recording both are one row. A value is that at the end of its step unless it says otherwise.
+    Joints and legs are in the order of ``robot.py``. A step is a policy step, a sample a physics step. A value belongs
+    to the end of its step unless it says otherwise.
     """
 
     contact: NDArray[np.bool_]

@@ -1,6 +1,6 @@
 """What a physical effect is: parameters, a law, and the places where it acts.
 
-One effect is one file with one class. Training, evaluation and the gap workflow use the same object; at its null values
+One effect is one class. Training, evaluation and the gap workflow use the same object; at its null values
 the robot moves as without it, bit for bit.
 """
 
@@ -122,7 +122,7 @@ class Effect(Memory):
     """
 
     title: ClassVar[str] = ""
-    """What it is, as the object of a sentence: "the model lacks ..."."""
+    """What it is, as the object of a sentence: "the model does not have ..."."""
     params: ClassVar[tuple[Param, ...]] = ()
     identification: ClassVar[Identification] = Identification()
     """How it is looked for in recordings."""

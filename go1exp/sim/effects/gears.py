@@ -156,8 +156,3 @@ class TwoMass(Memory):
         self._earlier.copy_(self.rate)
         self.rate += self._dt * (self._pull - self._share * acceleration)
         self.twist += self._dt * self.rate
-
-
-def resonance(compliance: float, rotor: float, joint: float) -> float:
-    """Return the frequency, Hz, at which rotor and joint (inertias in kg m2) swing against each other."""
-    return math.sqrt((1.0 / rotor + 1.0 / joint) / compliance) / (2.0 * math.pi)

@@ -107,19 +107,11 @@ class EffectStack:
 
     # ------------------------------------------------------------------ the step
 
-    def _chain(self, hook: str, value: Tensor, *others: Tensor) -> Tensor:
-        """Return ``value`` after the hook of one effect after the other."""
+    def through(self, hook: str, value: Tensor, *others: Tensor) -> Tensor:
+        """Return ``value`` after this hook of one effect after the other; the hooks are those of ``Effect``."""
         for effect in self._acting[hook]:
             value = getattr(effect, hook)(value, *others)
         return value
-
-    def on_target(self, target: Tensor) -> Tensor:
-        """Return the position target that the actuators act on."""
-        return self._chain("on_target", target)
-
-    def on_feedforward(self, torque: Tensor) -> Tensor:
-        """Return the feed-forward torque that reaches the actuators."""
-        return self._chain("on_feedforward", torque)
 
     def on_encoder(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
         """Return what the actuators' encoders read."""
@@ -128,22 +120,6 @@ class EffectStack:
         for effect in self._acting["on_encoder"]:
             q, qd = effect.on_encoder(q, qd)
         return q, qd
-
-    def on_error(self, target: Tensor, q: Tensor) -> Tensor:
-        """Return the targets as the actuators compare them with the encoders' angles."""
-        return self._chain("on_error", target, q)
-
-    def on_actuator(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
-        """Return the torque that the motors make."""
-        return self._chain("on_actuator", torque, q, qd)
-
-    def on_report(self, torque: Tensor) -> Tensor:
-        """Return the torque that the actuators report."""
-        return self._chain("on_report", torque)
-
-    def on_transmission(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
-        """Return the torque that reaches the joints."""
-        return self._chain("on_transmission", torque, q, qd)
 
     def gears(self) -> Gears:
         """Return how the gears yield."""
@@ -155,18 +131,6 @@ class EffectStack:
     def on_joint(self, q: Tensor, qd: Tensor) -> Tensor:
         """Return the sum of all torques on the joints that are not the actuators'."""
         return sum((e.on_joint(q, qd) for e in self._acting["on_joint"]), start=torch.zeros_like(q))
-
-    def on_friction(self, bound: Tensor, torque: Tensor, qd: Tensor) -> Tensor:
-        """Return the bound of the joints' dry friction."""
-        return self._chain("on_friction", bound, torque, qd)
-
-    def on_load(self, bound: Tensor, torque: Tensor, outside: Tensor) -> Tensor:
-        """Return the bound of the joints' dry friction with that of the gears' load."""
-        return self._chain("on_load", bound, torque, outside)
-
-    def on_base(self, wrench: Tensor) -> Tensor:
-        """Return the external wrench (N, 6) on the trunks."""
-        return self._chain("on_base", wrench)
 
     def measure(self, true: Measured) -> Measured:
         """Return what the robots' sensors say; the joint readings come from ``on_encoder``."""

@@ -24,7 +24,6 @@ from go1exp.mdp.commands import UniformVelocity, WideningVelocity
 from go1exp.mdp.feet import Feet
 from go1exp.mdp.ground import GroundHeight, HeightScan
 from go1exp.mdp.kinematics import KinematicState, lift
-from go1exp.mdp.randomizations import FEET
 from go1exp.mdp.types import Snapshot, StepResult
 from go1exp.sim.effects.rules import on_mount
 from go1exp.sim.env.engine import CapturedStep, Restarts, make_backend
@@ -158,7 +157,7 @@ class Go1Core:
         if path == DELAY:
             self.plant.actuator.set_range(*value)  # type: ignore[attr-defined, misc]  # checked with the schedule
         elif path == CONTACT_TIME:
-            self.backend.field(FEET_CONTACT_FIELD)[:, self.backend.ids("geom", FEET), 0] = value  # type: ignore[assignment]
+            self.backend.field(FEET_CONTACT_FIELD)[:, self.backend.ids("geom", robot.FEET), 0] = value  # type: ignore[assignment]
         else:
             self.terms.change(path, value)  # type: ignore[arg-type]
 

@@ -142,7 +142,7 @@ class Plant:
 
     def reported_torque(self) -> Tensor:
         """(N, J) what the actuators report of ``torque``, N m; never to be written to."""
-        return self.effects.on_report(self.torque)
+        return self.effects.through("on_report", self.torque)
 
     def speed(self) -> Tensor:
         """(N, J) joint velocities at the instant of ``q``, rad/s."""
@@ -173,28 +173,28 @@ class Plant:
         effects, q, qd = self.effects, self.q, self.speed()
         turn = self.qd - self._before if self._dry else None
         self._before.copy_(self.qd)
-        command = effects.on_target(torch.lerp(self._target, target, 0.5))
+        command = effects.through("on_target", torch.lerp(self._target, target, 0.5))
         self._target.copy_(target)
         encoder = effects.on_encoder(q, qd)
-        command = effects.on_error(command, encoder[0])
+        command = effects.through("on_error", command, encoder[0])
         if feedforward is None and self._fed is None:
             made = self.actuator.torque(command, *encoder)
         else:
             made = self._fed_forward(command, encoder, feedforward)
         if self.enabled is not None:  # a demand of zero, which a lag or a delay treats as any other
             made = made * self.enabled.unsqueeze(1)
-        self.torque.copy_(effects.on_actuator(made, *encoder))
+        self.torque.copy_(effects.through("on_actuator", made, *encoder))
         if self._bounded:
-            bound = effects.on_friction(self._bound, self.torque, qd)
+            bound = effects.through("on_friction", self._bound, self.torque, qd)
             if self._outside is not None:
-                bound = effects.on_load(bound, self.torque, self._outside)
+                bound = effects.through("on_load", bound, self.torque, self._outside)
             self.backend.field(FRICTION)[:, self._joints] = bound
-        geared = effects.on_transmission(self.torque, q, qd)
+        geared = effects.through("on_transmission", self.torque, q, qd)
         if self._has_joint_torques:
             geared = self._apply_joint_torques(geared, q, qd, turn)
         if self._floating and effects.acts("on_base"):
             wrench = self.backend.applied()[:, :6]
-            wrench.copy_(effects.on_base(torch.zeros_like(wrench)))
+            wrench.copy_(effects.through("on_base", torch.zeros_like(wrench)))
         self.backend.step(geared)
         if self._outside is not None:
             torch.neg(self._bias[:, self._joints], out=self._outside)
@@ -211,7 +211,7 @@ class Plant:
                 raise ConfigError([f"actuator: {kind} takes no feed-forward torque; {known}"])
             self._fed = torch.zeros_like(self.torque)
         given = torch.zeros_like(self._fed) if feedforward is None else feedforward
-        arriving = self.effects.on_feedforward(torch.lerp(self._fed, given, 0.5))
+        arriving = self.effects.through("on_feedforward", torch.lerp(self._fed, given, 0.5))
         self._fed.copy_(given)
         return cast("TakesFeedforward", self.actuator).torque(command, *encoder, arriving)
 

@@ -24,7 +24,7 @@ class Legs:
         model, _ = build_model(config, build_terrain(TerrainConfig(kind="flat")), 0.002, held=(1.0, 0.0, 0.0, 0.0))
         self.model, self._data = model, mujoco.MjData(model)
         self._bodies = [model.body(f"{leg}_calf").id for leg in robot.LEGS]
-        self._sites = [model.site(f"{leg}_foot").id for leg in robot.LEGS]
+        self._sites = [model.site(name).id for name in robot.FEET]
         self.trunk = model.body("trunk").id
         self.radius = float(model.geom(f"{robot.LEGS[0]}_foot").size[0])
         self.imu_site = np.array(model.site("imu").pos)
@@ -122,7 +122,7 @@ class Kinematics:
         """Compile the robot (``RobotConfig.inertia``) without any ground."""
         self._model = model = load_robot(inertia).compile()
         self._data = data = mujoco.MjData(model)
-        self._sites = [model.site(f"{leg}_foot").id for leg in robot.LEGS]
+        self._sites = [model.site(name).id for name in robot.FEET]
         joints = np.array([model.joint(name).id for name in robot.JOINTS])
         trunk = model.body("trunk").id
         assert list(model.jnt_dofadr[joints]) == list(range(BASE, BASE + robot.NUM_JOINTS))

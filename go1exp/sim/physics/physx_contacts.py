@@ -15,7 +15,7 @@ import numpy as np
 
 from go1exp import robot
 from go1exp.sim.physics.physx_robot import pair_friction
-from go1exp.sim.physics.scene import FLOOR
+from go1exp.sim.physics.scene import CONTACT_LINKS, FLOOR
 
 ROUNDING = 1e-4
 """Depth of a contact, m, beyond which it is one although it bears nothing: its body is pushed out at another point."""
@@ -36,9 +36,8 @@ class Contacts:
         self.foot_points = np.zeros((num_envs, robot.NUM_LEGS))
         self.foot_force = np.zeros((num_envs, robot.NUM_LEGS, 3))
         self._floor, self._body, self._dt = model.geom(FLOOR).id, model.geom_bodyid.tolist(), model.opt.timestep
-        self._foot = {model.geom(f"{leg}_foot").id: k for k, leg in enumerate(robot.LEGS)}
-        parts = [f"{leg}_{part}" for part in ("thigh", "calf") for leg in robot.LEGS]
-        self._links = [model.body(name).id for name in (*parts, "trunk", *(f"{leg}_hip" for leg in robot.LEGS))]
+        self._foot = {model.geom(name).id: k for k, name in enumerate(robot.FEET)}
+        self._links = [model.body(name).id for name in CONTACT_LINKS]
 
     def read(self, env: int, contacts: list[Any], shapes: dict[Any, int]) -> None:
         """Take in the contacts of one robot's last step; ``shapes`` gives the geom of each collision shape."""
@@ -76,7 +75,7 @@ class FootFriction:
         rows = np.repeat(np.arange(model.nv), model.M_rownnz)
         self._place = rows, np.asarray(model.M_colind)
         self._nv = model.nv
-        feet = [model.geom(f"{leg}_foot").id for leg in robot.LEGS]
+        feet = [model.geom(name).id for name in robot.FEET]
         self._feet, self._model = feet, model
         self._radius = model.geom_size[feet, 0]
         joints = [model.joint(f"{leg}_{kind}").id for leg in robot.LEGS for kind in robot.JOINT_KINDS]

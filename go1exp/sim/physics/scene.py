@@ -169,6 +169,12 @@ HELD_HEIGHT = 1.0
 RIGID = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """MuJoCo's impedance of dry friction; its default of 0.9 to 0.95 lets a joint creep."""
 
+CONTACT_LINKS = (
+    *(f"{leg}_{part}" for part in ("thigh", "calf") for leg in robot.LEGS),
+    *("trunk", *(f"{leg}_hip" for leg in robot.LEGS)),
+)
+"""Links whose contacts are counted, in the order of ``Sensors.link_contacts``."""
+
 _DATA_FOUND = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND)
 _DATA_FORCE = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)
 _REDUCE_NONE, _REDUCE_NETFORCE = 0, 3
@@ -277,8 +283,8 @@ def _set_contact(spec: mujoco.MjSpec, contact: ContactConfig) -> None:
     """Give the feet their contact: they have priority over the ground, so that what they say holds for the pair."""
     spec.option.cone = getattr(mujoco.mjtCone, f"mjCONE_{contact.cone.upper()}")
     spec.option.impratio = contact.impratio
-    for leg in robot.LEGS:
-        spec.geom(f"{leg}_foot").solref[0] = contact.time_constant
+    for name in robot.FEET:
+        spec.geom(name).solref[0] = contact.time_constant
 
 
 def _add_sensors(spec: mujoco.MjSpec, imu: bool) -> Sensors:
@@ -301,15 +307,13 @@ def _add_sensors(spec: mujoco.MjSpec, imu: bool) -> Sensors:
             end += size
         return slice(start, end)
 
-    feet = [f"{leg}_foot" for leg in robot.LEGS]
-    links = [f"{leg}_{part}" for part in ("thigh", "calf") for leg in robot.LEGS]
-    links += ["trunk", *(f"{leg}_hip" for leg in robot.LEGS)]
+    feet = list(robot.FEET)
     contact, on_imu = mujoco.mjtSensor.mjSENS_CONTACT, ["imu"] if imu else []
     return Sensors(
         foot_pos_w=block(feet, 3, mujoco.mjtSensor.mjSENS_FRAMEPOS, site, []),
         foot_vel_w=block(feet, 3, mujoco.mjtSensor.mjSENS_FRAMELINVEL, site, []),
         foot_contact=block(feet, 4, contact, geom, [_DATA_FOUND | _DATA_FORCE, _REDUCE_NETFORCE, 1]),
-        link_contacts=block(links, 1, contact, body, [_DATA_FOUND, _REDUCE_NONE, 1]),
+        link_contacts=block(list(CONTACT_LINKS), 1, contact, body, [_DATA_FOUND, _REDUCE_NONE, 1]),
         imu_gyro=block(on_imu, 3, mujoco.mjtSensor.mjSENS_GYRO, site, []),
         imu_acc=block(on_imu, 3, mujoco.mjtSensor.mjSENS_ACCELEROMETER, site, []),
         imu_quat=block(on_imu, 4, mujoco.mjtSensor.mjSENS_FRAMEQUAT, site, []),

@@ -17,7 +17,7 @@ from mujoco_warp._src import collision_gjk
 from mujoco_warp._src.collision_gjk import Geom, GJKResult, Polytope, _get_face_verts, _tri_affine_coord
 
 from go1exp import robot
-from go1exp.sim.physics.scene import FLOOR, Sensors
+from go1exp.sim.physics.scene import CONTACT_LINKS, FLOOR, Sensors
 
 _CONSTRAINT = 1
 """Bit of a contact that takes part in the dynamics (``mujoco_warp``'s ``ContactType.CONSTRAINT``)."""
@@ -62,10 +62,8 @@ class ContactReadings:
 
     def __init__(self, model: mujoco.MjModel, sensors: Sensors, capacity: int) -> None:
         """Find out where each shape's readings lie; ``capacity`` is the length of the list of contacts."""
-        links = [f"{leg}_{part}" for part in ("thigh", "calf") for leg in robot.LEGS]
-        links += ["trunk", *(f"{leg}_hip" for leg in robot.LEGS)]
-        column = {model.body(name).id: sensors.link_contacts.start + k for k, name in enumerate(links)}
-        foot = {model.geom(f"{leg}_foot").id: sensors.foot_contact.start + 4 * k for k, leg in enumerate(robot.LEGS)}
+        column = {model.body(name).id: sensors.link_contacts.start + k for k, name in enumerate(CONTACT_LINKS)}
+        foot = {model.geom(name).id: sensors.foot_contact.start + 4 * k for k, name in enumerate(robot.FEET)}
         self._foot_at = wp.array([foot.get(g, -1) for g in range(model.ngeom)], dtype=int)
         self._link_at = wp.array([column.get(int(body), -1) for body in model.geom_bodyid], dtype=int)
         self._floor = int(model.geom(FLOOR).id)

@@ -1,4 +1,4 @@
-"""Point masses: ``effect=payload`` on the trunk, ``effect=point_load`` on links."""
+"""Masses and inertias of trunk and links: ``effect=payload``, ``link_mass``, ``armature`` and others."""
 
 from __future__ import annotations
 
@@ -10,10 +10,143 @@ import torch
 from go1exp.config.schema.registry import effect
 from go1exp.robot.actuators import ModelFields
 from go1exp.sim.effects.base import Effect, Param
-from go1exp.sim.effects.identification import Identification
+from go1exp.sim.effects.identification import TWO_ATTITUDES, TWO_GAIN_SETS, Identification
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+
+@effect("armature")
+class Armature(Effect):
+    """Inertia that a joint has beyond that of the model: tau = -added qdd; the whole is nowhere negative.
+
+    Reflected inertia of rotor and gears. Published Go1 models have 0.004 to 0.01 kg m2 for one and the same joint; the
+    robot's configuration computes 0.0045 and 0.0101 from the vendor's rotor. It resembles ``payload`` or a smaller
+    ``strength`` wherever inertia rules, and ``link_inertia`` but for the coupling between joints.
+    """
+
+    title = "rotor inertia"
+    params = (Param("added", "kg m2", -0.01, 0.05, 0.0, 0.001, "joint", "inertia about the joint's axis"),)
+    identification = Identification(
+        nominal=True,
+        rank=3,
+        confounded=("kp_scale", "link_mass", "strength"),
+        separated_by=TWO_GAIN_SETS,
+    )
+    fields = ("dof_armature",)
+    added: Tensor
+
+    def edit_model(self, model: ModelFields) -> None:
+        """Add to the joints' own inertia."""
+        inertia = model.field("dof_armature")[:, -self.added.shape[1] :]
+        inertia.copy_((inertia + self.added).clamp(min=0.0))
+
+
+@effect("com_offset")
+class ComOffset(Effect):
+    """Centre of mass of the trunk, shifted in its own frame by (x, y, z).
+
+    Cables, batteries and computers are not where the drawing has them: up to 50 mm are randomised (MuJoCo Playground;
+    the paper, 25 mm). A held trunk shows none of it. Standing, it looks like ``base_tilt`` or a ``payload``.
+    """
+
+    title = "a shift of the trunk's centre of mass"
+    params = (
+        Param("x", "m", -0.1, 0.1, 0.0, 0.005, "robot", "shift forward"),
+        Param("y", "m", -0.1, 0.1, 0.0, 0.005, "robot", "shift to the left"),
+        Param("z", "m", -0.1, 0.1, 0.0, 0.005, "robot", "shift up"),
+    )
+    identification = Identification(nominal=True, rank=21, needs_ground=True, excitation="squat")
+    fields = ("body_ipos",)
+    x: Tensor
+    y: Tensor
+    z: Tensor
+
+    def edit_model(self, model: ModelFields) -> None:
+        """Shift it."""
+        shift = torch.cat([self.x, self.y, self.z], dim=1)
+        model.field("body_ipos")[:, model.ids("body", ("trunk",))] += shift.unsqueeze(1)
+
+
+@effect("link_com")
+class LinkCom(Effect):
+    """Centre of mass of the link that a joint moves, shifted in that link's frame; mass and inertia about it stay.
+
+    By ``forward`` and ``left`` along its x and y axes, and by ``along`` against z, which is down the leg: with all
+    joints of a Go1 at zero the legs hang straight and every link has the trunk's axes. 1 to 20 mm are likely, along
+    the calf from the mass of the foot, across from motors and cables (estimate). A shift along a joint's own axis
+    does not turn that joint. In one pose the torque of gravity is also that of ``link_mass``, of an
+    ``encoder_offset`` or of ``base_tilt``.
+    """
+
+    title = "a shift of link mass"
+    params = (
+        Param("along", "m", -0.05, 0.05, 0.0, 0.002, "joint", "shift away from the trunk"),
+        Param("forward", "m", -0.05, 0.05, 0.0, 0.002, "joint", "shift along the link's x axis"),
+        Param("left", "m", -0.05, 0.05, 0.0, 0.002, "joint", "shift along the link's y axis"),
+    )
+    identification = Identification(
+        nominal=True,
+        rank=7,
+        confounded=("base_tilt", "encoder_offset"),
+        separated_by=TWO_ATTITUDES,
+    )
+    fields = ("body_ipos",)
+    along: Tensor
+    forward: Tensor
+    left: Tensor
+
+    def edit_model(self, model: ModelFields) -> None:
+        """Shift it."""
+        shift = torch.stack([self.forward, self.left, -self.along], dim=-1)
+        model.field("body_ipos")[:, model.ids("body", self.setup.joints)] += shift
+
+
+@effect("link_inertia")
+class LinkInertia(Effect):
+    """Rotational inertia of the link that a joint moves, about its centre of mass, scaled by one factor.
+
+    Mass that sits further from, or nearer to, the centre than the model says: +-20 % are likely (estimate). It shows
+    at fast motion only, like ``armature``, from which the coupling between joints tells it.
+    """
+
+    title = "a change of link inertia"
+    params = (Param("scale", "-", 0.5, 2.0, 1.0, 0.1, "joint", "inertia over the model's"),)
+    fields = ("body_inertia",)
+    scale: Tensor
+
+    def edit_model(self, model: ModelFields) -> None:
+        """Scale it."""
+        model.field("body_inertia")[:, model.ids("body", self.setup.joints)] *= self.scale.unsqueeze(-1)
+
+
+@effect("link_mass")
+class LinkMass(Effect):
+    """Mass and inertia of the link that a joint moves, scaled by one factor; its centre of mass stays.
+
+    A link of another density. Published Go1 models differ by 12 % (thigh 0.90 to 1.01 kg, calf 0.196 to 0.218). In one
+    pose the torque of gravity is also that of ``link_com``; ``strength`` scales it the other way round.
+    """
+
+    title = "a change of link mass"
+    params = (Param("scale", "-", 0.5, 2.0, 1.0, 0.05, "joint", "mass over the model's"),)
+    identification = Identification(
+        nominal=True,
+        rank=6,
+        weighs_on_legs=True,
+        uniform=True,
+        confounded=("armature", "kp_scale", "strength"),
+        separated_by=TWO_GAIN_SETS,
+    )
+    fields = ("body_mass", "body_inertia")
+    scale: Tensor
+
+    def edit_model(self, model: ModelFields) -> None:
+        """Scale both."""
+        links = model.ids("body", self.setup.joints)
+        model.field("body_mass")[:, links] *= self.scale
+        model.field("body_inertia")[:, links] *= self.scale.unsqueeze(-1)
+
 
 FIELDS = ("body_mass", "body_ipos", "body_inertia", "body_iquat")
 """Model fields that :func:`join` writes."""

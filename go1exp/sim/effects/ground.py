@@ -1,4 +1,4 @@
-"""``effect=ground_compliance``: the feet sink into the ground."""
+"""Contact of the feet: ``effect=foot_friction``, ``ground_compliance``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,32 @@ from go1exp.sim.effects.identification import Identification
 if TYPE_CHECKING:
     from torch import Tensor
 
-FEET = tuple(f"{leg}_foot" for leg in robot.LEGS)
+
+@effect("foot_friction")
+class FootFriction(Effect):
+    """Sliding friction of the feet, scaled: a foot slips beyond scale x mu x the normal force of its contact.
+
+    The model's foot has mu = 0.8 and the higher priority in a contact, so that its value is the contact's, whatever it
+    stands on. Real ground has 0.3 to 1.2. A randomisation of ``foot_friction`` with ``operation: scale`` starts from
+    this; with ``set`` it replaces this. It shows while a foot slips only, and resembles a slope of the ground.
+    """
+
+    title = "a change of foot friction"
+    params = (Param("scale", "-", 0.1, 2.5, 1.0, 0.1, "robot", "friction over the model's"),)
+    identification = Identification(
+        nominal=True,
+        rank=22,
+        needs_ground=True,
+        levels=({"scale": -0.3}, {"scale": 0.3}),
+        excitation="squat",
+    )
+    fields = ("geom_friction",)
+    scale: Tensor
+
+    def edit_model(self, model: ModelFields) -> None:
+        """Scale it."""
+        model.field("geom_friction")[:, model.ids("geom", robot.FEET), 0] *= self.scale
+
 
 NULL = 0.0
 """Leaves the time constant of the model, that of ``contact``."""
@@ -57,7 +82,7 @@ class GroundCompliance(Effect):
 
     def edit_model(self, model: ModelFields) -> None:
         """Set the feet's, which have priority in a contact."""
-        feet = model.ids("geom", FEET)
+        feet = model.ids("geom", robot.FEET)
         before = model.field("geom_solref")[:, feet, 0]
         changed = self.time_constant != NULL
         model.field("geom_solref")[:, feet, 0] = torch.where(changed, self.time_constant, before)

@@ -1,4 +1,4 @@
-"""``effect=joint_stop``: the hard stops of the joints are elsewhere, yield, or throw back."""
+"""Torques that depend on the angle: ``effect=cogging``, ``joint_stop``, ``parallel_stiffness``."""
 
 from __future__ import annotations
 
@@ -11,10 +11,41 @@ from go1exp.base.tensors.restitution import damping_ratio
 from go1exp.config.schema.registry import effect
 from go1exp.robot.actuators import ModelFields
 from go1exp.sim.effects.base import Effect, Param
-from go1exp.sim.effects.identification import Identification
+from go1exp.sim.effects.identification import LARGEST_ANGLE, LEAST_ANGLE, MEAN_ANGLE, Identification, Periodic
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+
+@effect("cogging")
+class Cogging(Effect):
+    """A torque that is periodic in the joint's angle: tau = amplitude sin(count q + phase).
+
+    Slots that attract magnets, teeth that mesh. Amplitudes of 0.1 to 0.8 N m are likely (estimate). ``count``
+    periods make one turn of the joint; its usual value of 38 is six for each turn of a rotor behind the Go1's gear
+    ratio of 6.333, an assumption (not published). It conserves energy, but data that are not sorted by
+    angle show it as ``coulomb``. A step must not skip a period: count times speed times step should stay below 1.
+    """
+
+    title = "cogging torque"
+    params = (
+        Param("amplitude", "N m", 0.0, 2.0, 0.0, 0.05, "joint", "largest torque"),
+        Param("count", "-", 1.0, 150.0, 38.0, math.inf, "joint", "periods per turn of the joint"),
+        Param("phase", "rad", -math.pi, math.pi, 0.0, math.inf, "joint", "phase at angle zero"),
+    )
+    identification = Identification(
+        # Over a radian of motion, neighbouring counts differ by half a period.
+        periodic=Periodic("amplitude", "phase", "count", counts=tuple(float(count) for count in range(18, 64, 3))),
+        free_shapes=("phase", "count"),
+        excitation="slow_ramps",
+    )
+    amplitude: Tensor
+    count: Tensor
+    phase: Tensor
+
+    def on_joint(self, q: Tensor, qd: Tensor) -> Tensor:
+        """Return the torque at this angle."""
+        return self.amplitude * torch.sin(self.count * q + self.phase)
 
 
 NULL = 0.02
@@ -70,3 +101,30 @@ class JointStop(Effect):
         middle = 0.5 * (low + high)
         ends[..., 0] = torch.where(self.lower != 0.0, torch.minimum(low + self.lower, middle), low)
         ends[..., 1] = torch.where(self.upper != 0.0, torch.maximum(high + self.upper, middle), high)
+
+
+@effect("parallel_stiffness")
+class ParallelStiffness(Effect):
+    """A spring between the links beside the actuator: tau = -stiffness (q - rest).
+
+    Cables and covers: 0.5 to 5 N m/rad (estimate). It acts on the joint, so the actuator neither limits nor reports it;
+    ``rest`` is the true angle without its torque. It resembles ``kp_scale`` and, within a small range of angles,
+    gravity.
+    """
+
+    title = "a spring beside the actuator"
+    params = (
+        Param("stiffness", "N m/rad", 0.0, 20.0, 0.0, 0.1, "joint", "torque per angle"),
+        Param("rest", "rad", -5.0, 5.0, 0.0, math.inf, "joint", "angle without torque"),
+    )
+    identification = Identification(
+        shapes=tuple({"rest": angle} for angle in (MEAN_ANGLE, LEAST_ANGLE, LARGEST_ANGLE)),
+        free_shapes=("rest",),
+        excitation="slow_ramps",
+    )
+    stiffness: Tensor
+    rest: Tensor
+
+    def on_joint(self, q: Tensor, qd: Tensor) -> Tensor:
+        """Return the spring's torque."""
+        return -self.stiffness * (q - self.rest)
