@@ -12,13 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from go1exp.config.schema.registry import Term
-from go1exp.evaluate.statistics.intervals import (
-    Interval,
-    mean_interval,
-    phase_interval,
-    rate_interval,
-    share_interval,
-)
+from go1exp.evaluate.statistics.intervals import Interval, mean_interval, phase_interval, rate_interval, share_interval
 from go1exp.mdp.measures import measured, per_foot
 from go1exp.mdp.measures.trace import Trace
 
@@ -176,7 +170,7 @@ def columns_of(terms: Sequence[Term], legs: Sequence[str]) -> list[Column]:
     return entries_so_far
 
 
-def add_measures(rows: Sequence[Row], measures: Mapping[str, Any], legs: Sequence[str]) -> None:
+def add_measures(rows: Sequence[Row], measures: Mapping[str, Any], legs: Sequence[str] = ()) -> None:
     """Write the measures, (N,) or (N, 4) each by name, None if not measured, into the rows of the N robots."""
     for name, each in measures.items():
         if each is None or each.dtype.kind == "U":

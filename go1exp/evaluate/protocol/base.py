@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
 
+import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import Field, TypeAdapter, ValidationError
 
 from go1exp.base.report.plots import Drawing
@@ -26,7 +28,6 @@ from go1exp.evaluate.protocol.claims import Claim
 from go1exp.evaluate.quantities import FINGERPRINT, LIFE, Column, Derived, Row
 
 if TYPE_CHECKING:
-    from go1exp.evaluate.protocol.lengths import Length
     from go1exp.evaluate.protocol.plan import Motion
     from go1exp.evaluate.protocol.stage import Stage
 
@@ -38,6 +39,57 @@ Impulse = Annotated[float, Field(gt=0), within(0.0, 500.0, "N s")]
 Coordinate = Annotated[float, within(-0.5, 0.5, "m")]
 Point = tuple[Coordinate, Coordinate, Coordinate]
 """Where a kick acts, from the trunk's origin in its frame, m: far off it would turn the trunk without limit."""
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A setting that determines the length of a batch.
+
+    Attributes:
+        key: its name.
+        value: its value.
+        least: its lower bound.
+        fitting: length, s -> the value that makes the batch so long, all other settings unchanged.
+        unit: of the value.
+        falling: whether the length falls as the value grows.
+    """
+
+    key: str
+    value: float
+    least: float = 0.0
+    fitting: Callable[[float], float] = lambda seconds: seconds
+    unit: str = " s"
+    falling: bool = False
+
+    def limit(self, seconds: float) -> str | None:
+        """Return the limit of the value for a length of ``seconds`` as text; None if that is out of bounds."""
+        most = self.fitting(seconds)
+        if most < self.least:
+            return None
+        if self.falling:  # rounded to the side that fits
+            return f"{1.006 * most:.3g}{self.unit} at least"
+        return f"{0.994 * most:.3g}{self.unit} at most"
+
+
+@dataclass(frozen=True)
+class Length:
+    """Length of one batch of robots.
+
+    Attributes:
+        seconds: the length, s.
+        robots: number of robots.
+        causes: settings that determine the length, the likeliest to be wrong first.
+        settle_s: time at its start that does not count, s.
+        recorded: whether the channels of measures are recorded after it.
+        policy_dt: period of their policy, s; None is that of the stage.
+    """
+
+    seconds: float
+    robots: int
+    causes: Sequence[Cause]
+    settle_s: float = 0.0
+    recorded: bool = False
+    policy_dt: float | None = None
 
 
 @dataclass
@@ -170,6 +222,14 @@ def repeated(name: str, values: Sequence[Any]) -> list[str]:
     """Return a message about a setting with a repeated value: its robots would be one condition."""
     twice = [v for k, v in enumerate(values) if v in values[:k]]
     return [f"{name}: has {twice[0]} twice"] if twice else []
+
+
+def rounded(values: ArrayLike) -> list[Any]:
+    """Return values of any shape as plain data with four decimals; NaN as None."""
+    each = np.asarray(values, dtype=np.float64)
+    plain = each.round(4).astype(object)
+    plain[np.isnan(each)] = None
+    return list(plain.tolist())
 
 
 def lives(motion: Motion) -> list[Row]:

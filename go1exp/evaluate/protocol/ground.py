@@ -19,13 +19,8 @@ from go1exp.sim.terrain import Terrain, TerrainConfig, as_stored
 GroundName = Literal["slope_up", "slope_down", "gravel", "waves", "stairs_up", "stairs_down", "boxes"]
 
 UNITS: dict[str, str] = {
-    "slope_up": "deg",
-    "slope_down": "deg",
-    "gravel": "m",
-    "waves": "m",
-    "stairs_up": "m",
-    "stairs_down": "m",
-    "boxes": "m",
+    **dict.fromkeys(("slope_up", "slope_down"), "deg"),
+    **dict.fromkeys(("gravel", "waves", "stairs_up", "stairs_down", "boxes"), "m"),
 }
 """Of each ground's difficulty: angle; largest height of a grain, crest over trough, rise of a step, height of a box."""
 

@@ -12,32 +12,13 @@ from typing import Any
 from go1exp import __version__
 from go1exp.base import memory
 from go1exp.base.wording import counted
-from go1exp.config.schema.physics import BackendConfig
 from go1exp.config.schema.registry import ConfigError, TooLongError
 from go1exp.evaluate.agents import Agent, Progress
-from go1exp.evaluate.protocol.base import Chosen, Played, Protocol
+from go1exp.evaluate.protocol.base import Chosen, Length, Played, Protocol
 from go1exp.evaluate.protocol.claims import Verdict, evaluated
-from go1exp.evaluate.protocol.lengths import Length
-from go1exp.evaluate.protocol.stage import Setting, Stage
+from go1exp.evaluate.protocol.stage import Rates, Setting, Stage
 from go1exp.evaluate.quantities import Derived, Row, about, distinct, plain, resampled, summary
 from go1exp.evaluate.statistics.intervals import Interval, bootstrap_interval
-
-
-@dataclass(frozen=True)
-class Rates:
-    """Settings of the command line for all protocols.
-
-    Attributes:
-        seed: seed of everything random.
-        policy_dt: another period of the policy, s; None keeps that of training.
-        physics_dt: another physics step, s; None keeps that of training.
-        engine: physics engine; None takes MuJoCo on the CPU.
-    """
-
-    seed: int
-    policy_dt: float | None = None
-    physics_dt: float | None = None
-    engine: BackendConfig | None = None
 
 
 @dataclass
@@ -126,16 +107,8 @@ def refuse_lengths(protocols: Sequence[Chosen], agent: Agent, rates: Rates) -> N
 
 
 def _stage(protocol: Protocol, agent: Agent, rates: Rates, on_step: Progress = lambda done, total: None) -> Stage:
-    setting = Setting(
-        protocol.noise,
-        protocol.randomize,
-        protocol.trunk_velocity,
-        rates.seed,
-        rates.policy_dt,
-        rates.physics_dt,
-        rates.engine,
-    )
-    return Stage(agent, setting, on_step)
+    noise, randomize, velocity = protocol.noise, protocol.randomize, protocol.trunk_velocity
+    return Stage(agent, Setting(**vars(rates), noise=noise, randomize=randomize, trunk_velocity=velocity), on_step)
 
 
 def summarised(chosen: Chosen, rows: Sequence[Row]) -> list[dict[str, Any]]:

@@ -17,7 +17,7 @@ from go1exp.config.schema.physics import BackendConfig
 from go1exp.config.schema.registry import Entry, Term, members
 from go1exp.evaluate.agents import Agent, Progress
 from go1exp.evaluate.observed import TrunkVelocity
-from go1exp.evaluate.protocol.lengths import Length
+from go1exp.evaluate.protocol.base import Length
 from go1exp.evaluate.protocol.plan import STEP_BYTES, Array, Impulses, Kicker, Motion, Plan, heading
 from go1exp.evaluate.recorder import Recorder, bytes_per_step
 from go1exp.evaluate.rollout import DELAY, EvalConfig, delayed, evaluation_task, require_agreement
@@ -27,26 +27,29 @@ from go1exp.sim.task import TaskConfig
 
 
 @dataclass(frozen=True)
-class Setting:
-    """What all protocols of one call share.
+class Rates:
+    """Settings of the command line for all protocols.
 
     Attributes:
-        noise: add observation noise.
-        randomize: randomise robots and starts.
-        trunk_velocity: what the policy sees of it.
         seed: seed of everything random.
         policy_dt: another period of the policy, s; None keeps that of training.
         physics_dt: another physics step, s; None keeps that of training.
         engine: physics engine; None takes MuJoCo on the CPU.
     """
 
-    noise: bool
-    randomize: bool
-    trunk_velocity: TrunkVelocity
     seed: int
     policy_dt: float | None = None
     physics_dt: float | None = None
     engine: BackendConfig | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setting(Rates):
+    """The same with those of one protocol: observation noise, randomisation, and the observed trunk velocity."""
+
+    noise: bool
+    randomize: bool
+    trunk_velocity: TrunkVelocity
 
 
 class Stage:

@@ -13,8 +13,8 @@ from go1exp.base.report import plots
 from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Played
-from go1exp.evaluate.protocol.kinds.steady import ERRORS, Steady, command_text
+from go1exp.evaluate.protocol.base import Played, rounded
+from go1exp.evaluate.protocol.kinds.steady import ERRORS, Steady, by_axis, command_text
 from go1exp.evaluate.quantities import Column, Row
 
 if TYPE_CHECKING:
@@ -60,9 +60,8 @@ class Corners(Steady):
             up_steps = np.isfinite(along).any(1)
             mean = np.full(len(along), np.nan)
             mean[up_steps] = np.nanmean(along[up_steps], axis=1)
-            name = command_text(dict(zip(("x", "y", "yaw"), map(float, command), strict=True)))
-            shares[name] = [None if np.isnan(v) else round(float(v), 4) for v in mean]
-        return {"t": [round(float(v), 4) for v in motion.t], "along": shares}
+            shares[command_text(by_axis(command))] = rounded(mean)
+        return {"t": rounded(motion.t), "along": shares}
 
     def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
         """Draw the answers of all subjects."""

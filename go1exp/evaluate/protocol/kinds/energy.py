@@ -17,7 +17,7 @@ from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Played
 from go1exp.evaluate.protocol.kinds.gait import straight
 from go1exp.evaluate.protocol.kinds.steady import ERRORS, Steady
-from go1exp.evaluate.quantities import Column, Row
+from go1exp.evaluate.quantities import Column, Row, add_measures
 from go1exp.mdp.measures.trace import Trace, mean_over
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ PROTECTED_AT = 100.0
 POWER = (
     Column("power_p99", "W", "sum over joints of |tau qd|, 99th percentile over steps", better="lower"),
     Column("power_max", "W", "the same, largest", better="lower"),
+    Column("saturated", "", "share of time and joints at 99 % of peak torque or more", better="lower"),
 )
 
 
@@ -52,13 +53,7 @@ class Energy(Steady):
             "heat_per_way", "N m s", "sum of tau^2 over weight and way, a measure of the windings' heat", better="lower"
         ),
         *POWER,
-        Column("saturated", "", "share of time and joints at 99 % of peak torque or more", better="lower"),
-        Column(
-            "protect_level",
-            "",
-            "lowest level of the SDK's PowerProtect that the largest power stays below",
-            better="lower",
-        ),
+        Column("protect_level", "", "lowest level of the SDK's PowerProtect above the largest power", better="lower"),
     )
     always: ClassVar[tuple[str, ...]] = (
         *("cost_of_transport", "torque_share_p99", "joint_speed_share_p99", "envelope_share_p99"),
@@ -67,9 +62,7 @@ class Energy(Steady):
     def also(self, motion: Motion, rows: Sequence[Row], settle: int) -> None:
         """Write what the trace says of power and heat."""
         assert motion.trace is not None
-        figures = effort(motion.trace)
-        for n, row in enumerate(rows):
-            row |= {name: float(v[n]) if np.isfinite(v[n]) else None for name, v in figures.items()}
+        add_measures(rows, effort(motion.trace))
 
     def curves(self, motion: Motion, rows: Sequence[Row], settle: int) -> dict[str, Any]:
         """Return torque and speed of some joints at some instants, by kind of joint."""
@@ -126,8 +119,7 @@ def _cost(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
     figure, axes = plots.panels(1, height=2.3)
     ax = axes[0, 0]
     for k, (who, summary) in enumerate(summaries.items()):
-        entries = sorted(straight(summary), key=lambda e: e["condition"]["x"])
-        at = [e["condition"]["x"] for e in entries]
+        at, entries = straight(summary)
         plots.intervals(ax, at, entries, "cost_of_transport", plots.COLOURS[k], who or "positive work")
         if len(summaries) == 1:
             plots.intervals(ax, at, entries, "cost_of_transport_abs", plots.COLOURS[1], "all work")

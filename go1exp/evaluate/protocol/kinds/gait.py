@@ -13,8 +13,8 @@ from go1exp.base.report import plots
 from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Played
-from go1exp.evaluate.protocol.kinds.steady import ERRORS, Steady, command_text
+from go1exp.evaluate.protocol.base import Played, rounded
+from go1exp.evaluate.protocol.kinds.steady import ERRORS, Steady, by_axis, command_text
 from go1exp.evaluate.quantities import Column, Row
 from go1exp.mdp.measures.gait import touchdown_phase
 from go1exp.mdp.measures.trace import find_runs
@@ -68,9 +68,7 @@ class Gait(Steady):
                 [int(c), round(a * trace.contact_dt, 4), round(b * trace.contact_dt, 4)]
                 for c, a, b in zip(runs.column, runs.start, runs.stop, strict=True)
             ]
-            phase = [[None if np.isnan(v) else round(float(v), 4) for v in row] for row in phases[robots]]
-            name = command_text(dict(zip(("x", "y", "yaw"), map(float, command), strict=True)))
-            feet[name] = {"stances": stances, "phases": phase}
+            feet[command_text(by_axis(command))] = {"stances": stances, "phases": rounded(phases[robots])}
         return {"feet": feet}
 
     def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
@@ -120,14 +118,8 @@ def _circle(feet: Mapping[str, Any]) -> Figure:
     for ax, (name, shown) in zip(axes.flat, feet.items(), strict=False):
         for foot in range(robot.NUM_LEGS):
             turn = [2.0 * np.pi * p[foot] for p in shown["phases"] if p[foot] is not None]
-            ax.plot(
-                turn,
-                np.full(len(turn), 1.0 - 0.12 * foot),
-                "o",
-                ms=3,
-                color=plots.COLOURS[foot],
-                label=robot.LEGS[foot],
-            )
+            radius = np.full(len(turn), 1.0 - 0.12 * foot)
+            ax.plot(turn, radius, "o", ms=3, color=plots.COLOURS[foot], label=robot.LEGS[foot])
         ax.set_theta_zero_location("N")
         ax.set_theta_direction(-1)
         ax.set_ylim(0.0, 1.1)
@@ -153,8 +145,7 @@ SPEED = (
 def _over_speed(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
     figure, axes = plots.panels(3, 2, sharex=True)
     for k, (who, summary) in enumerate(summaries.items()):
-        entries = sorted(straight(summary), key=lambda e: e["condition"]["x"])
-        at = [e["condition"]["x"] for e in entries]
+        at, entries = straight(summary)
         for ax, (name, _) in zip(axes.flat, SPEED, strict=True):
             plots.intervals(ax, at, entries, name, plots.COLOURS[k], who)
     for ax, (_, text) in zip(axes.flat, SPEED, strict=True):
@@ -166,8 +157,8 @@ def _over_speed(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
     return figure
 
 
-def straight(summary: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Return the conditions whose command is straight ahead or back."""
-    return [
-        e for e in summary if not e["condition"].get("y") and not e["condition"].get("yaw") and "x" in e["condition"]
-    ]
+def straight(summary: Sequence[Mapping[str, Any]]) -> tuple[list[float], list[Mapping[str, Any]]]:
+    """Return the conditions whose command is straight ahead or back, by rising velocity, m/s; the velocities first."""
+    ahead = [e for e in summary if "x" in e["condition"] and not any(e["condition"].get(k) for k in ("y", "yaw"))]
+    ahead.sort(key=lambda e: e["condition"]["x"])
+    return [e["condition"]["x"] for e in ahead], ahead

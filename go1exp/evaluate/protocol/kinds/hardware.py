@@ -13,13 +13,12 @@ from go1exp.base.report import plots
 from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Played, lives
+from go1exp.evaluate.protocol.base import Length, Played, lives
 from go1exp.evaluate.protocol.claims import evaluated
-from go1exp.evaluate.protocol.kinds.energy import effort
+from go1exp.evaluate.protocol.kinds.energy import POWER, effort
 from go1exp.evaluate.protocol.kinds.rate import LATEST_MS
-from go1exp.evaluate.protocol.kinds.steady import AXES, ERRORS, Steady
-from go1exp.evaluate.protocol.lengths import Length
-from go1exp.evaluate.quantities import Column, Derived, Row
+from go1exp.evaluate.protocol.kinds.steady import AXES, ERRORS, Steady, by_axis
+from go1exp.evaluate.quantities import FELL, Column, Derived, Row, add_measures, summary
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,12 +40,7 @@ class Hardware(Steady):
 
     keys: ClassVar[tuple[str, ...]] = (*AXES, "delay_ms")
     derived_names: ClassVar[tuple[str, ...]] = ("delay_margin",)
-    robot_columns: ClassVar[tuple[Column, ...]] = (
-        *ERRORS,
-        Column("power_p99", "W", "sum over joints of |tau qd|, 99th percentile over steps", better="lower"),
-        Column("power_max", "W", "the same, largest", better="lower"),
-        Column("saturated", "", "share of time and joints at 99 % of peak torque or more", better="lower"),
-    )
+    robot_columns: ClassVar[tuple[Column, ...]] = (*ERRORS, *POWER)
     always: ClassVar[tuple[str, ...]] = (
         *("torque_share_p99", "joint_speed_share_p99", "envelope_share_p99", "target_step_p99", "slip_share_all"),
         *("touchdown_speed_p95", "peak_force_p95"),
@@ -77,8 +71,7 @@ class Hardware(Steady):
         delay = np.repeat(np.array(self.delays_ms) * 1e-3, each)
         rows = lives(stage.run(Plan(command, delay=delay)))
         for n, row in enumerate(rows):
-            velocity = map(float, velocities[n % each])
-            row |= {**dict(zip(AXES, velocity, strict=True)), "robot": n % self.robots}
+            row |= {**by_axis(velocities[n % each]), "robot": n % self.robots}
             row["delay_ms"] = float(self.delays_ms[n // each])
         played.rows += rows
         return played
@@ -87,9 +80,7 @@ class Hardware(Steady):
         """Write power and saturation."""
         assert motion.trace is not None
         figures = effort(motion.trace)
-        for n, row in enumerate(rows):
-            for name in ("power_p99", "power_max", "saturated"):
-                row[name] = float(figures[name][n]) if np.isfinite(figures[name][n]) else None
+        add_measures(rows, {column.name: figures[column.name] for column in POWER})
 
     def derived(self, rows: Sequence[Row]) -> list[Derived]:
         """Return the delay margin."""
@@ -137,15 +128,9 @@ def _items(hardware: Hardware, summary: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def _falls(rows: Sequence[Row]) -> Figure:
-    from go1exp.evaluate.statistics.intervals import share_interval
-
     figure, axes = plots.panels(1, height=1.9)
-    delays = sorted({row["delay_ms"] for row in rows})
-    entries = []
-    for delay in delays:
-        fell = [bool(row["fell"]) for row in rows if row["delay_ms"] == delay]
-        i = share_interval(sum(fell), len(fell))
-        entries.append({"figures": {"fell": {"estimate": i.estimate, "low": i.low, "high": i.high}}})
+    entries = summary(rows, ("delay_ms",), (FELL,))
+    delays = [e["condition"]["delay_ms"] for e in entries]
     plots.intervals(axes[0, 0], delays, entries, "fell", plots.MEASURED, "")
     axes[0, 0].set(xlabel="command delay (ms)", ylabel="share that fell", ylim=(-0.03, 1.03))
     return figure

@@ -14,8 +14,7 @@ from go1exp.base.report import plots
 from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import NonNegative, Positive, protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Impulse, Played, Point, Protocol, lives, repeated
-from go1exp.evaluate.protocol.lengths import Cause, Length
+from go1exp.evaluate.protocol.base import Cause, Impulse, Length, Played, Point, Protocol, lives, repeated, rounded
 from go1exp.evaluate.protocol.signals import Signal
 from go1exp.evaluate.quantities import Column, Row
 
@@ -88,14 +87,8 @@ class Kicks(Protocol):
     robot_columns: ClassVar[tuple[Column, ...]] = (
         Column("survived", "", "survival rate of the robots still standing before this kick", "share", "higher"),
         Column("up", "", "still standing after this kick, of all", "share", "higher"),
-        Column(
-            "recovered",
-            "",
-            "came back to height and velocity before the next kick, of those up before",
-            "share",
-            "higher",
-        ),
-        Column("recovery_s", "s", "time until then, of those that did", better="lower"),
+        Column("recovered", "", "recovered before the next kick, of those standing before", "share", "higher"),
+        Column("recovery_s", "s", "recovery time of the robots that recovered", better="lower"),
         Column("min_height", "m", "lowest height of the trunk, excluding falls", better="higher"),
         Column("min_height_25hz", "m", "the same of samples at 25 Hz, as the paper plots"),
         Column("peak_speed", "m/s", "largest change of the horizontal velocity, excluding falls"),
@@ -197,9 +190,9 @@ class Kicks(Protocol):
         speed = np.linalg.norm(motion.velocity[:, n, :2], axis=-1)
         rest = slice(round((self.first_s - BEFORE) / motion.dt), round(self.first_s / motion.dt))
         plain = {"t": motion.t, "height": motion.height[:, n], "speed": speed}
-        kept: dict[str, Any] = {k: [round(float(x), 4) for x in v[alive]] for k, v in plain.items()}
-        kicks = [round(float(s), 3) for s in self.starts()[n]]
-        return {**kept, "kicks": kicks, "nominal": float(motion.height[rest, n].mean()), "dt": motion.dt}
+        kept: dict[str, Any] = {k: rounded(v[alive]) for k, v in plain.items()}
+        kicks, nominal = self.starts()[n].round(3).tolist(), float(motion.height[rest, n].mean())
+        return {**kept, "kicks": kicks, "nominal": nominal, "dt": motion.dt}
 
     def _sides(self) -> NDArray[np.float64]:
         """(N,) direction of the force on each robot, from its heading counter-clockwise, rad."""
@@ -216,11 +209,7 @@ class Kicks(Protocol):
         alive = motion.alive[rows, robots][:, keep]
         side = self._sides()
         along = motion.velocity[..., 0] * np.cos(side) + motion.velocity[..., 1] * np.sin(side)
-        curves: dict[str, Any] = {
-            "impulse": float(self.impulses[k]),
-            "t": (steps * dt).round(4).tolist(),
-            "n": int(keep.sum()),
-        }
+        curves = {"impulse": float(self.impulses[k]), "t": rounded(steps * dt), "n": int(keep.sum())}
         for name, values in (("height", motion.height), ("speed", along)):
             each = np.where(alive, values[rows, robots][:, keep], np.nan)
             up_steps = np.isfinite(each).any(1)
@@ -228,7 +217,7 @@ class Kicks(Protocol):
             if up_steps.any():
                 bands[0, up_steps] = np.nanmedian(each[up_steps], axis=1)
                 bands[1:, up_steps] = np.nanpercentile(each[up_steps], (10.0, 90.0), axis=1)
-            curves[name] = [[None if np.isnan(x) else round(float(x), 4) for x in b] for b in bands]
+            curves[name] = rounded(bands)
         return curves
 
     def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:

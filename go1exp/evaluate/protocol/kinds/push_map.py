@@ -14,8 +14,7 @@ from go1exp.base.report import plots
 from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import Positive, protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Count, Impulse, Played, Point, Protocol, lives
-from go1exp.evaluate.protocol.lengths import Cause, Length
+from go1exp.evaluate.protocol.base import Cause, Count, Impulse, Length, Played, Point, Protocol, lives
 from go1exp.evaluate.protocol.signals import Signal
 from go1exp.evaluate.quantities import Column, Derived, Row, values
 

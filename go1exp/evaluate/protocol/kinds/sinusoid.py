@@ -13,8 +13,7 @@ from go1exp.base.report import plots
 from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import Positive, protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Played, Protocol, lives, repeated
-from go1exp.evaluate.protocol.lengths import Cause, Length
+from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, lives, repeated, rounded
 from go1exp.evaluate.protocol.signals import Sine, response
 from go1exp.evaluate.quantities import Column, Row
 
@@ -144,18 +143,15 @@ def _curve(motion: Motion, robots: slice) -> dict[str, Any]:
     one = velocity[:, 0]
     named = {"mean": bands[0], "low": bands[1], "high": bands[2], "one": one}
     named["command"] = motion.command[::EVERY, robots.start]
-    plain = {k: [[None if np.isnan(x) else round(float(x), 4) for x in row] for row in v] for k, v in named.items()}
-    return {"t": [round(float(x), 4) for x in motion.t[::EVERY]], **plain}
-
-
-def _array(values: Any) -> np.ndarray:
-    return np.array(values, dtype=np.float64)
+    return {"t": rounded(motion.t[::EVERY]), **{name: rounded(values) for name, values in named.items()}}
 
 
 def _rows(curve: Mapping[str, Any]) -> Figure:
     figure, axes = plots.panels(3, sharex=True)
-    t, mean, command = curve["t"], _array(curve["mean"]), _array(curve["command"])
-    low, high, one = (_array(curve[name]) for name in ("low", "high", "one"))
+    t = curve["t"]
+    mean, low, high, one, command = (
+        np.array(curve[name], dtype=np.float64) for name in ("mean", "low", "high", "one", "command")
+    )
     for a, name in enumerate(plots.AXES):
         ax = axes[a, 0]
         plots.band(ax, t, low[:, a], high[:, a], plots.MEASURED)

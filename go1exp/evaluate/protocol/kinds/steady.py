@@ -10,10 +10,9 @@ from pydantic import Field
 
 from go1exp.config.schema.registry import NonNegative, Positive
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Played, Protocol, lives, repeated
-from go1exp.evaluate.protocol.lengths import Cause, Length
+from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, lives, repeated
 from go1exp.evaluate.protocol.signals import Constant, Velocity
-from go1exp.evaluate.quantities import Column, Row
+from go1exp.evaluate.quantities import Column, Row, add_measures
 
 if TYPE_CHECKING:
     from go1exp.evaluate.protocol.plan import Motion
@@ -74,11 +73,8 @@ class Steady(Protocol):
         rows = lives(motion)
         error = _error(motion, settle)
         for n, row in enumerate(rows):
-            velocity = self.commands[n // self.robots]
-            row |= {**dict(zip(AXES, map(float, velocity), strict=True)), "robot": n % self.robots}
-            row |= {
-                f"rmse_{axis}": float(v) if np.isfinite(v) else None for axis, v in zip(AXES, error[n], strict=True)
-            }
+            row |= {**by_axis(self.commands[n // self.robots]), "robot": n % self.robots}
+        add_measures(rows, {f"rmse_{axis}": error[:, k] for k, axis in enumerate(AXES)})
         self.measure(motion, rows)
         self.also(motion, rows, settle)
         return Played(rows, self.curves(motion, rows, settle))
@@ -97,6 +93,11 @@ def _error(motion: Motion, settle: int) -> np.ndarray:
     square = np.where(up, (motion.velocity - motion.command)[settle:] ** 2, 0.0).sum(0)
     count = up.sum(0)
     return np.sqrt(np.divide(square, count, out=np.full(square.shape, np.nan), where=count > 0))
+
+
+def by_axis(command: Sequence[float]) -> dict[str, float]:
+    """Return a command (3,) by the names of its axes."""
+    return dict(zip(AXES, map(float, command), strict=True))
 
 
 def command_text(condition: Mapping[str, Any]) -> str:

@@ -13,9 +13,8 @@ from go1exp.base.report import plots
 from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import NonNegative, PositiveRange, Speed, protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Played, Protocol, lives, repeated
+from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, lives, repeated
 from go1exp.evaluate.protocol.ground import UNITS, GroundName, Lanes, goal
-from go1exp.evaluate.protocol.lengths import Cause, Length
 from go1exp.evaluate.quantities import Column, Derived, Row, values
 from go1exp.evaluate.statistics.intervals import Logistic, logistic_fit
 
@@ -156,7 +155,8 @@ class OnTerrain(Protocol):
 
     def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
         """Draw the curves of all subjects."""
-        return [_drawing({who: (plays[who].rows, summaries[who]) for who in plays})]
+        text = "Share that reached the end of its lane, Wilson's 95 % interval and logistic fit; slopes in degrees."
+        return [Drawing("success", "Success against difficulty", text, partial(_success, plays, summaries))]
 
 
 def _fit(rows: Sequence[Row]) -> Logistic | None:
@@ -174,22 +174,13 @@ def _where(rows: Sequence[Row], share: float, top: float) -> float:
     return float(np.clip(fit.where(share), 0.0, top))
 
 
-Subjects = Mapping[str, tuple[Sequence[Row], Sequence[Mapping[str, Any]]]]
-
-
-def _drawing(subjects: Subjects) -> Drawing:
-    text = "Share that came to the end of its lane, with Wilson's 95 % interval, and a logistic fit; slopes in degrees."
-    return Drawing("success", "Success against difficulty", text, partial(_success, subjects))
-
-
-def _success(subjects: Subjects) -> Figure:
-    first = next(iter(subjects.values()))[1]
-    grounds = list(dict.fromkeys(e["condition"]["ground"] for e in first))
+def _success(plays: Mapping[str, Played], summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+    grounds = list(dict.fromkeys(e["condition"]["ground"] for e in next(iter(summaries.values()))))
     columns = 2 if len(grounds) > 1 else 1
     figure, axes = plots.panels(-(-len(grounds) // columns), columns, height=1.6, sharey=True)
-    for w, (who, (rows, summary)) in enumerate(subjects.items()):
+    for w, (who, played) in enumerate(plays.items()):
         for ax, ground in zip(axes.flat, grounds, strict=False):
-            _curve(ax, [r for r in rows if r["ground"] == ground], summary, ground, who, w)
+            _curve(ax, [r for r in played.rows if r["ground"] == ground], summaries[who], ground, who, w)
     for ax, ground in zip(axes.flat, grounds, strict=False):
         ax.set_title(ground.replace("_", " "), loc="left")
         ax.set(xlabel=f"difficulty ({UNITS[ground]})", ylim=(-0.04, 1.04))
