@@ -17,7 +17,6 @@ from go1exp.config.schema.physics import BackendConfig
 from go1exp.config.schema.registry import Entry, Term, members
 from go1exp.evaluate.agents import Agent, Progress
 from go1exp.evaluate.observed import TrunkVelocity
-from go1exp.evaluate.protocol.base import Length
 from go1exp.evaluate.protocol.plan import STEP_BYTES, Array, Impulses, Kicker, Motion, Plan, heading
 from go1exp.evaluate.recorder import Recorder, bytes_per_step
 from go1exp.evaluate.rollout import DELAY, EvalConfig, delayed, evaluation_task, require_agreement
@@ -78,11 +77,11 @@ class Stage:
         """Return the physics step with a policy of that period, s."""
         return self.setting.physics_dt or fitting_step(policy_dt, self.agent.task.sim.physics_dt)
 
-    def bytes_per_second(self, length: Length) -> tuple[float, float]:
+    def bytes_per_second(self, robots: int, policy_dt: float | None) -> tuple[float, float]:
         """Return what robots take, B/s: always, and beside it while what measures need is recorded."""
-        dt = length.policy_dt or self.policy_dt
+        dt = policy_dt or self.policy_dt
         recorded = bytes_per_step(round(dt / self.physics_dt(dt)))
-        return length.robots * STEP_BYTES / dt, length.robots * recorded / dt
+        return robots * STEP_BYTES / dt, robots * recorded / dt
 
     def expect(self, steps_of_robots: float) -> None:
         """Add to the expected number of policy steps times robots, for the progress."""
