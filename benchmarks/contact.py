@@ -1,4 +1,4 @@
-"""What the contact of the feet does to a walk: ``python -m benchmarks.contact [policy=hop] [robots=10]``.
+"""What the contact of the feet does to a walk: ``python -m benchmarks.contact [policy=paper] [robots=10]``.
 
 A shipped policy walks on contacts of several time constants, cones and physics steps: how deep its feet sink, how much
 of the loaded time they slip, how hard they land. ``fine=true`` adds physics of 0.25 ms, the reference. Then the speed
@@ -71,7 +71,7 @@ def steps_per_second(task: TaskConfig, contact: ContactConfig) -> float:
 
 def main(arguments: Sequence[str]) -> None:
     """Print the table."""
-    given = {"policy": "hop", "robots": "10", "fine": "false"} | dict(a.split("=", 1) for a in arguments)
+    given = {"policy": "paper", "robots": "10", "fine": "false"} | dict(a.split("=", 1) for a in arguments)
     config, policy, _ = load_run(shipped_policies()[given["policy"]])
     print("sink p99 mm, slip % of the loaded time, peak force p95 in body weights, at 1 and 2 m/s and 1 rad/s")
     for contact, step in CONTACTS + (FINE if given["fine"] == "true" else ()):

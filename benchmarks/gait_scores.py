@@ -198,7 +198,7 @@ def simulated() -> Iterator[tuple[str, dict[str, Tensor]]]:
             yield step >= 50, core.snapshot()
 
     yield "random actions, standard deviation 1", mean_scores(shake())
-    config, policy, _ = load_run(data_root() / "assets" / "policies" / "hop")
+    config, policy, _ = load_run(data_root() / "assets" / "policies" / "paper")
     wanted = EvalConfig(
         *(((1.0, 0.0, 0.0),), 16, 20.0, 2.0),
         noise=True,
@@ -217,7 +217,7 @@ def simulated() -> Iterator[tuple[str, dict[str, Tensor]]]:
             observation = shipped.step(policy(observation)).observation
             yield step >= 100, shipped.snapshot()
 
-    yield "policy=hop, of version 0.1, 1 m/s", mean_scores(walk())
+    yield "policy=paper, 1 m/s", mean_scores(walk())
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -53,7 +53,10 @@ def without_engine(core: Go1Core) -> Iterator[None]:
 ROUGH = ("terrain=rough", "terrain.cols=2", "terrain.border=2.0", "curriculum=terrain_level")
 
 
-CHANGING = ("actuator.command", "contact.time_constant", "reward.gait.weight", "reward.gait.full_cycle")
+CHANGING = (
+    *("actuator.command", "contact.time_constant", "command.slow_fraction"),
+    *("reward.gait.weight", "reward.gait.full_cycle"),
+)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +73,7 @@ def test_a_step_holds_nothing_that_a_graph_cannot(choices: tuple[str, ...], make
 
 
 def test_a_step_whose_settings_change_holds_nothing_that_a_graph_cannot(make_task: Callable[..., TaskConfig]) -> None:
-    core = Go1Core(make_task("reward=paper_trot", "actuator=delay", "backend.threads=1"), 4, changing=CHANGING)
+    core = Go1Core(make_task("reward=paper", "command=widening", "backend.threads=1"), 4, changing=CHANGING)
     for path in CHANGING:
         core.change(path, (0.0, 0.01) if path == "actuator.command" else 0.01)
     core.reset()

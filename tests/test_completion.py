@@ -25,7 +25,7 @@ from go1exp.sim.task import PPOConfig
 PROGRAM = "import sys; from go1exp.cli import main; sys.exit(main())"
 
 
-POLICIES = ("hop", "paper", "robust", "trot")
+POLICIES = ("paper", "robust", "robust_history", "trot")
 """Shipped ones."""
 
 
@@ -83,7 +83,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("train resume=runs/f", {"resume=runs/flat"}),
         (
             "train start_from=",
-            {f"start_from={f}" for f in ("hop", "paper", "robust", "trot", "gap/", "logs/", "mine/", "runs/")},
+            {
+                f"start_from={f}"
+                for f in ("paper", "robust", "robust_history", "trot", "gap/", "logs/", "mine/", "runs/")
+            },
         ),
         ("train --he", {"--help"}),
         ("eval run=r", {"run=runs/"}),

@@ -150,7 +150,6 @@ NEEDS = {
     "experiment/study_cpu": ["experiment=study", "backend=cpu", "ppo=small"],
     "experiment/robust": ["experiment=trot", "backend=cpu"],
     "experiment/robust_history": ["experiment=robust", "backend=cpu"],
-    "experiment/paper_trot": ["reward=paper_trot", "command=widening", "actuator=delay", "ppo=warp"],
 }
 """Choices that other choices must go with."""
 
@@ -226,7 +225,7 @@ OTHER: dict[str, Callable[[Walk], list[Any]]] = {
     "train:device": lambda walk: ["cuda"],
     "train:logger.wandb": lambda walk: [{"project": "p", "mode": "offline", "group": None, "entity": None}],
     "train:resume": lambda walk: [str(walk.trained("resumed"))],
-    "train:start_from": lambda walk: ["hop"],
+    "train:start_from": lambda walk: ["paper"],
     "train:actuator.file": lambda walk: [str(walk.net(1))],
     "train:actuator.period": lambda walk: ["resample"],
     "train:effect": lambda walk: [{"coulomb": {"bound": 0.4}}],
@@ -854,7 +853,7 @@ def verb_trace(container: dict[str, Any], walk: Walk) -> Trace:
         patch.setattr(sys, "argv", sys.argv)
         patch.setenv("HYDRA_FULL_ERROR", "0")  # the verb changes both
         patch.setattr(trainer, "train", noted)
-        fitting = ["ppo=paper"] if container["start_from"] else []  # the network of policy=hop
+        fitting = ["ppo=paper"] if container["start_from"] else []  # the network of policy=paper
         assert APP.run([*fitting, f"hydra.run.dir={walk.folder() / 'new'}", *chosen]) == 0
     yield "folder", folders
 

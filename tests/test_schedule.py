@@ -19,7 +19,7 @@ from go1exp.train.schedule import Schedule
 from tests import test_resume
 from tests.test_resume import SIX, assert_the_same_run, rows, train_here
 
-FLAT = (*test_resume.FLAT, "reward=paper_literal", "schedule=none")
+FLAT = (*test_resume.FLAT, "reward=paper_literal", "schedule=none", "actuator=pd", "contact=soft", "command=paper")
 
 STEPS = 64
 """Of all robots together in an iteration of ``FLAT``."""
@@ -76,6 +76,13 @@ def test_a_ramp_without_an_end_leads_to_the_configured_value() -> None:
     assert {key: of_key.last for key, of_key in schedule.items()} == {"x": 7.0, "d": (0.01, 0.02), "c": 0.005}
 
 
+def test_an_optional_ramp_is_left_out_of_a_task_without_its_setting() -> None:
+    delay, slow = "set: actuator.command, from: [0.0, 0.0]", "set: command.slow_fraction, from: 0.0"
+    ramps = [ramp(f"{text}, over: 100, optional: true", key) for key, text in (("d", delay), ("s", slow))]
+    assert set(train_config("actuator=delay", "command=widening", *ramps).schedule) == {"d", "s"}
+    assert set(train_config("actuator=pd", "command=paper", *ramps).schedule) == set()
+
+
 def test_a_ramp_may_count_iterations() -> None:
     _, schedule = built(ramp(f"{WEIGHT}, start: 2, over: 4, unit: iterations"))
     values = []
@@ -94,6 +101,8 @@ def test_a_ramp_may_count_iterations() -> None:
         ("reward.gait.full_cycle", 0.2, ("reward=paper",)),
         ("actuator.command", [0.02, 0.02], ("actuator=delay",)),
         ("contact.time_constant", 0.005, ()),
+        ("command.slow_fraction", 0.9, ("command=widening",)),
+        ("command.zero_fraction", 0.9, ("command=widening",)),
     ],
 )
 def test_a_setting_that_was_changed_acts_as_if_it_had_been_configured(
@@ -231,6 +240,7 @@ def test_every_metric_of_a_training_may_start_a_ramp(tmp_path: Path) -> None:
         ("set: reward.gait.scale, from: [1, 2], to: [1, 2], over: 1", "schedule.x.from = [1.0, 2.0]: input should be"),
         ("set: contact.time_constant, from: 0.02, to: 0.5, over: 1", "schedule.x.to = 0.5: input should be less than"),
         ("set: actuator.command, from: [0, 0], to: [0, 0.01], over: 1", "needs actuator=delay"),
+        ("set: command.slow_fraction, from: 0, over: 1", "needs a command.slow_fraction above 0"),
         ("set: reward.gait.weight, from: 0, to: 1, over: 1, start: 1, when: {measure: rollout/return, above: 1}",
          "start has no meaning beside it"),
         ("set: reward.gait.weight, from: 0, to: 1, over: 1, when: {measure: rollout/return}", "one of below and above"),

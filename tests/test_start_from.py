@@ -109,19 +109,19 @@ def test_from_the_command_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     big = [*(o for o in SMALL if "hidden" not in o), "ppo=paper", *SMALL[:4]]
-    assert APP.run([*big, "start_from=hop", "hydra.run.dir=tuned"]) == 0
+    assert APP.run([*big, "start_from=paper", "hydra.run.dir=tuned"]) == 0
     assert json.loads((tmp_path / "tuned/start.json").read_text())["num_timesteps"] > 1e8
     assert "starting from" in capsys.readouterr().out
-    assert parse_train(run_folder.read_config(tmp_path / "tuned")).process.start_from == "hop"
+    assert parse_train(run_folder.read_config(tmp_path / "tuned")).process.start_from == "paper"
 
     assert APP.run(["resume=tuned", "ppo.iterations=2"]) == 0
     for wanted, told in ((2, "tuned has 2 iterations already; now"), (1, "already, more than the 1 asked for; now")):
         assert APP.run(["resume=tuned", f"ppo.iterations={wanted}"]) == 0
         assert told in capsys.readouterr().out
 
-    run = tmp_path / "hop"  # a run folder goes before a shipped policy of its name
+    run = tmp_path / "paper"  # a run folder goes before a shipped policy of its name
     train_here(run, "ppo.hidden=[512,256,128]")
-    assert APP.run([*big, "start_from=hop", "hydra.run.dir=of_the_folder"]) == 0
+    assert APP.run([*big, "start_from=paper", "hydra.run.dir=of_the_folder"]) == 0
     assert json.loads((tmp_path / "of_the_folder/start.json").read_text())["num_timesteps"] == 16
 
     for wrong, said in (

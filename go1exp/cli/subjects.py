@@ -87,7 +87,7 @@ def robot_as_data(parts: dict[str, Any]) -> dict[str, Any]:
     return {name: plain(part) for name, part in parts.items()}
 
 
-CONDITIONS = "hop"
+CONDITIONS = "paper"
 """Shipped policy whose robot, ground and noise another controller walks under where no run is named."""
 
 

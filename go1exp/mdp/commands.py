@@ -58,8 +58,9 @@ class UniformVelocity(Memory):
         device = stream.key.device
         ranges = torch.tensor([lin_vel_x, lin_vel_y, ang_vel_z, hold_time], device=device)
         self._low, self._high = ranges.unbind(1)
-        self._standing_fraction, self._zero_fraction = standing_fraction, zero_fraction
-        self._slow_fraction = slow_fraction
+        self._standing_fraction = standing_fraction
+        shares = {"zero_fraction": zero_fraction, "slow_fraction": slow_fraction}
+        self._shares = {name: torch.tensor(share, device=device) for name, share in shares.items() if share}
         self._hard_share, self._stream = hard_share, stream
         self.value = torch.zeros(len(stream.key), 3, device=device)
         self.time_left = torch.zeros(len(stream.key), device=device)
@@ -70,12 +71,16 @@ class UniformVelocity(Memory):
         due = (self.time_left <= 1e-6) | restart
         draw = self._stream.uniform(4, low=self._low, high=self._high)
         asked = self._stream.uniform(1) >= self._standing_fraction
-        if self._zero_fraction:
-            asked = asked & (self._stream.uniform(3) >= self._zero_fraction)
-        if self._slow_fraction:
-            asked = asked * torch.where(self._stream.uniform(1) < self._slow_fraction, SLOW, 1.0)
+        if "zero_fraction" in self._shares:
+            asked = asked & (self._stream.uniform(3) >= self._shares["zero_fraction"])
+        if "slow_fraction" in self._shares:
+            asked = asked * torch.where(self._stream.uniform(1) < self._shares["slow_fraction"], SLOW, 1.0)
         self.value.copy_(torch.where(due.unsqueeze(1), draw[:, :3] * asked * self._in_force(), self.value))
         self.time_left.copy_(torch.where(due, draw[:, 3], self.time_left))
+
+    def change(self, name: str, value: float) -> None:
+        """Change ``zero_fraction`` or ``slow_fraction``, which must not have been 0, in place."""
+        self._shares[name].fill_(value)
 
     def share(self) -> Tensor | float:
         """Share of the ranges that velocities are drawn from."""

@@ -8,7 +8,7 @@ A name of the group is one ramp (``config/schema/training.py``)::
     stiff: {set: contact.time_constant, from: 0.02, to: 0.005, when: {measure: gait/trot_error, below: 0.1}, over: 20e6}
 
 ``start`` and ``over`` count steps of all robots together since the run began, or iterations (``unit``). The values in
-the groups ``reward``, ``actuator`` and ``contact`` are those of a run without the schedule, and those with which the
+the groups ``reward``, ``actuator``, ``contact`` and ``command`` are those of a run without the schedule, and those with which the
 policy is evaluated.
 """
 
@@ -27,10 +27,12 @@ from go1exp.config.schema.training import Ramp, Value
 DELAY = "actuator.command"
 CONTACT_TIME = "contact.time_constant"
 WEIGHT = "weight"
+SHARES = ("command.zero_fraction", "command.slow_fraction")
+"""Shares of commands; one that is 0 is not drawn, and cannot change."""
 FEET_CONTACT_FIELD = "geom_solref"
 """Model field that holds the time constant of the feet's contacts."""
 
-KEYS = ("set", "from", "to", "start", "over", "when", "unit")
+KEYS = ("set", "from", "to", "start", "over", "when", "unit", "optional")
 
 
 def parse(settings: Any, parts: Mapping[str, Any]) -> tuple[dict[str, Ramp], list[str]]:
@@ -52,7 +54,8 @@ def parse(settings: Any, parts: Mapping[str, Any]) -> tuple[dict[str, Ramp], lis
             problems.append(f"schedule.{key}.set = {ramp.path!r}: is set by schedule.{setters[ramp.path]} too")
         setters[ramp.path] = key
         problems += _target_problems(f"schedule.{key}", ramp, parts)
-    return ramps, problems
+    known = changeable(parts)
+    return {key: ramp for key, ramp in ramps.items() if ramp.path in known or not ramp.optional}, problems
 
 
 def _with_end(ramp: Ramp, parts: Mapping[str, Any]) -> Ramp:
@@ -63,6 +66,8 @@ def _with_end(ramp: Ramp, parts: Mapping[str, Any]) -> Ramp:
         value: Value = parts["contact"].time_constant
     elif ramp.path == DELAY:
         value = parts["actuator"].parameters["command"]
+    elif ramp.path in SHARES:
+        value = parts["command"].parameters[ramp.path.removeprefix("command.")]
     else:
         key, _, name = ramp.path.removeprefix("reward.").rpartition(".")
         term = next(t for t in parts["reward"] if t.key == key)
@@ -71,9 +76,11 @@ def _with_end(ramp: Ramp, parts: Mapping[str, Any]) -> Ramp:
 
 
 def changeable(parts: Mapping[str, Any]) -> list[str]:
-    """Return the keys of all settings that a schedule may change: reward weights and numbers, delay, contact."""
+    """Return the keys of all settings that a schedule may change: reward weights and numbers, delay, contact, commands."""
     paths = [f"reward.{t.key}.{name}" for t in parts.get("reward") or () for name in (WEIGHT, *_numbers(t))]
-    return [*paths, *([DELAY] if _is_delay(parts) else []), CONTACT_TIME]
+    command = parts["command"].parameters if parts.get("command") else {}
+    shares = [path for path in SHARES if command.get(path.removeprefix("command."))]
+    return [*paths, *([DELAY] if _is_delay(parts) else []), CONTACT_TIME, *shares]
 
 
 def _numbers(term: Term) -> list[str]:
@@ -92,8 +99,12 @@ def _target_problems(path: str, ramp: Ramp, parts: Mapping[str, Any]) -> list[st
     """Return what is wrong with the setting that a ramp names and with its two values."""
     known = changeable(parts)
     if ramp.path not in known:
+        if ramp.optional:
+            return []
         if ramp.path == DELAY and parts.get("actuator"):
             return [f"{path}.set = {DELAY!r}: needs actuator=delay"]
+        if ramp.path in SHARES:
+            return [f"{path}.set = {ramp.path!r}: needs a {ramp.path} above 0, which the ramp leads to"]
         return [unknown_name(f"{path}.set", ramp.path, known, "setting")]
     problems = []
     assert ramp.last is not None
@@ -117,8 +128,9 @@ def _value_problems(path: str, target: str, value: Value, parts: Mapping[str, An
         if not of_delay and isinstance(value, tuple) and value[1] > longest:
             of_delay = [f"{path} = {list(value)!r}: exceeds {DELAY} = {list(term.parameters['command'])}, the longest"]
         return of_delay
-    key, _, name = target.removeprefix("reward.").rpartition(".")
-    term = next(t for t in parts["reward"] if t.key == key)
+    group, _, rest = target.partition(".")
+    key, _, name = rest.rpartition(".")
+    term = parts["command"] if group == "command" else next(t for t in parts["reward"] if t.key == key)
     if name == WEIGHT:
         return [] if isinstance(value, float) else [f"{path} = {list(value)!r}: must be one number"]
     return _renamed(term.entry.check({**term.parameters, name: value}, "")[1], name, path)

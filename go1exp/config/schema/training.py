@@ -263,6 +263,7 @@ class Ramp:
         over: time that the ramp takes, in unit; 0 is a jump.
         when: start at a metric's threshold instead, {measure, below or above, iterations}.
         unit: steps of all robots together, or iterations, which suit small and large batches alike.
+        optional: leave the ramp out of a task without this setting, such as a delay with actuator=pd.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
@@ -274,6 +275,7 @@ class Ramp:
     start: NonNegative | None = None
     when: Trigger | None = None
     unit: Literal["steps", "iterations"] = "steps"
+    optional: bool = False
 
     def __post_init__(self) -> None:
         """Check what concerns two settings."""
