@@ -7,9 +7,9 @@ A name of the group is one ramp (``config/schema/training.py``)::
     delay: {set: actuator.command, from: [0.0, 0.0], to: [0.0, 0.03], start: 40e6, over: 20e6}
     stiff: {set: contact.time_constant, from: 0.02, to: 0.005, when: {measure: gait/trot_error, below: 0.1}, over: 20e6}
 
-``start`` and ``over`` count steps of all robots together since the run began, or iterations (``unit``). The values in
-the groups ``reward``, ``actuator``, ``contact`` and ``command`` are those of a run without the schedule, and those with which the
-policy is evaluated.
+``start`` and ``over`` count steps of all robots together since the run began, or iterations (``unit``). The configured
+values of ``reward``, ``actuator``, ``contact`` and ``command`` are those of a run without the schedule, and those with
+which the policy is evaluated.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def _with_end(ramp: Ramp, parts: Mapping[str, Any]) -> Ramp:
 
 
 def changeable(parts: Mapping[str, Any]) -> list[str]:
-    """Return the keys of all settings that a schedule may change: reward weights and numbers, delay, contact, commands."""
+    """Return the keys of all settings that a schedule may change: of rewards, delay, contact and commands."""
     paths = [f"reward.{t.key}.{name}" for t in parts.get("reward") or () for name in (WEIGHT, *_numbers(t))]
     command = parts["command"].parameters if parts.get("command") else {}
     shares = [path for path in SHARES if command.get(path.removeprefix("command."))]
