@@ -138,9 +138,12 @@ def make_logger(config: LoggerConfig, run: Path, iteration: int, settings: dict[
     """
     writers: list[KVWriter] = []
     if config.tensorboard:
-        writers.append(TensorBoardWriter(run / "tensorboard", steps))
-        if settings and not steps:
-            writers[-1].write({"hparams": _hparams(settings)}, {"hparams": ()}, 0)
+        try:
+            writers.append(TensorBoardWriter(run / "tensorboard", steps))
+            if settings and not steps:
+                writers[-1].write({"hparams": _hparams(settings)}, {"hparams": ()}, 0)
+        except AssertionError:
+            print("tensorboard is not installed: metrics go to the other writers only")
     if config.csv:
         writers.append(CsvWriter(run, iteration))
     if config.wandb is not None:
