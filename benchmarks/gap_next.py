@@ -34,10 +34,9 @@ from go1exp.config.schema.registry import bind
 from go1exp.config.schema.settings import parse
 from go1exp.evaluate.statistics.intervals import bootstrap_interval
 from go1exp.gap.comparison import Comparison, compare
-from go1exp.gap.design.choice import COARSE, ENOUGH, Judge, Pair, choose
-from go1exp.gap.design.plan import Attitude, Design, Limits, library, limits_of
+from go1exp.gap.design.choice import COARSE, ENOUGH, Evaluator, Pair, choose
+from go1exp.gap.design.plan import Attitude, Design, DesignSettings, Limits, library, limits_of
 from go1exp.gap.design.rehearsal import Rehearsal, Stage
-from go1exp.gap.design.settings import DesignSettings
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import GapSettings
 from go1exp.gap.robots.go1 import suspended
@@ -117,13 +116,13 @@ class Bench:
         episode = replace(episode, seed=1000 * self.seed + len(self.recordings))
         self.recordings += play(self.rig, [episode], self.sensors, self.seed, lambda done, total: None)
 
-    def judged(self) -> tuple[Comparison, Judge, float]:
+    def evaluated(self) -> tuple[Comparison, Evaluator, float]:
         """Return the recordings compared, the pair, and the power so far."""
         comparison = compare(self.recordings, self.robot, self.settings)
         case = self.case
         pair = Pair(case.truth, case.rival, case.theta, {}, (case.rival,), 0.0, 0.02)
-        judge = Judge(pair, comparison.scorer, comparison.settings, COARSE * comparison.dt)
-        return comparison, judge, judge.worth(judge.at_hand).power
+        evaluator = Evaluator(pair, comparison.scorer, comparison.settings, COARSE * comparison.dt)
+        return comparison, evaluator, evaluator.worth(evaluator.at_hand).power
 
     def searched(self) -> Row:
         """Return what ``go1exp gap`` makes of the recordings, which knows nothing of the pair."""
@@ -133,8 +132,8 @@ class Bench:
         wrong = [n for n in result.named if n.status == "certified" and self.case.truth not in n.alias_set]
         names = [f"{' or '.join(n.alias_set)} ({n.status})" for n in result.named]
         equals = len(right[0].alias_set) if right else 0
-        judged = {"named": bool(right), "equals": equals, "false": len(wrong)}
-        return judged | {"answer": ", ".join([result.verdict, *names])}
+        evaluated = {"named": bool(right), "equals": equals, "false": len(wrong)}
+        return evaluated | {"answer": ", ".join([result.verdict, *names])}
 
     def stage(self, comparison: Comparison, settings: DesignSettings) -> Stage:
         """Return where designs are rehearsed."""
@@ -155,9 +154,9 @@ def _episode(played: Rehearsal, name: str) -> Episode:
     return Episode(name, played.design.excitation, played.motion, played.kp[0], played.kd[0], hang, None, 0)
 
 
-def _designed(bench: Bench, comparison: Comparison, judge: Judge, settings: DesignSettings) -> Episode | None:
+def _designed(bench: Bench, comparison: Comparison, evaluator: Evaluator, settings: DesignSettings) -> Episode | None:
     choice = choose(
-        bench.stage(comparison, settings), [judge], _attitudes(settings), settings, lambda what, share: None
+        bench.stage(comparison, settings), [evaluator], _attitudes(settings), settings, lambda what, share: None
     )
     return _episode(choice.best, f"next_{len(bench.recordings)}") if choice.best else None
 
@@ -185,7 +184,7 @@ def run(
     powers: list[float] = []
     ended = "not told apart"
     for turn in range(most + 1):
-        comparison, judge, power = bench.judged()
+        comparison, evaluator, power = bench.evaluated()
         powers.append(power)
         if power >= ENOUGH:
             ended = TOLD_APART
@@ -197,7 +196,7 @@ def run(
             bench.add(bench.standard(kind, settings.seconds, gains, 100 * seed + 10 + turn))
             continue
         if strategy == "next":
-            episode = _designed(bench, comparison, judge, settings)
+            episode = _designed(bench, comparison, evaluator, settings)
         else:
             episode = _drawn(bench, comparison, settings)
         if episode is None:

@@ -15,7 +15,7 @@ from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError
 from go1exp.config.schema.settings import parse
 from go1exp.gap.answer import decide
-from go1exp.gap.files import _errors
+from go1exp.gap.files import from_dict
 from go1exp.gap.report import words
 from go1exp.gap.result import AngleErrors, GapResult, GapSettings, NamedEffect
 from go1exp.gap.score import angle_errors
@@ -80,10 +80,10 @@ def test_every_joint_of_a_window_must_be_within_beside_the_noise(monkeypatch: py
 def test_the_report_says_the_share_and_older_files_have_none() -> None:
     errors = AngleErrors(10, (0.005, 0.001), 0.8, 0.1, {"a": (0.005, 0.001)}, {"e": (0.005, 0.001)}, (0.2, 0.95))
     assert "Within the accepted error: 20 % of the windows before, 95 % after." in words.angles(errors)
-    plain = dataclasses.asdict(errors)
-    assert _errors(plain) == errors
-    older = {k: v for k, v in plain.items() if k != "within"}
-    assert _errors(older) == dataclasses.replace(errors, within=None)
+    plain = GapResult("no gap", "", errors=errors).as_dict()
+    assert from_dict(plain).errors == errors
+    del plain["errors"]["within"], plain["tolerances"]
+    assert from_dict(plain).errors == dataclasses.replace(errors, within=None)
     assert "accept" not in words.angles(dataclasses.replace(errors, within=None))
 
 

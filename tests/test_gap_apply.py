@@ -146,15 +146,6 @@ def test_a_result_that_is_missing_or_damaged_is_refused_in_words(tmp_path: Path)
             files.load(tmp_path)
 
 
-def test_a_result_of_an_older_version_which_says_bags_is_read(tmp_path: Path) -> None:
-    file = files.save(whole(), tmp_path)
-    plain = json.loads(file.read_text())
-    plain["bags"] = plain.pop("bootstrap_share")
-    del plain["tolerances"]
-    file.write_text(json.dumps(plain))
-    assert files.load(tmp_path).bootstrap_share["coulomb"] == 0.9
-
-
 def test_the_public_face_of_gap_has_every_name_that_it_promises() -> None:
     from go1exp import gap
 

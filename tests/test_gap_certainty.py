@@ -14,7 +14,7 @@ from go1exp.gap.answer import Answer, bounded_joints, weak_joints
 from go1exp.gap.result import Candidate, GapSettings, NamedEffect
 from go1exp.gap.search.candidates import Trial
 from go1exp.gap.search.certainty import beside_a_gap, doubt, widened
-from go1exp.gap.search.search import LastCheck, Search
+from go1exp.gap.search.state import LastCheck, Search
 from go1exp.gap.sentence import sentence
 from go1exp.sim.effects.tolerances import DECLARED, declared
 
@@ -57,7 +57,7 @@ class Stub:
     signal: dict[str, float] = field(default_factory=dict)
     own: float = 0.9
     first: float = 100.0
-    strained: bool = False
+    marginal: bool = False
     select_chi2: float = 2.0
     settings: GapSettings = field(default_factory=GapSettings)
     state: Any = field(
@@ -105,7 +105,7 @@ def test_a_term_is_judged_by_what_it_took_itself_not_by_what_all_took(own: float
 def test_beside_a_large_effect_a_small_one_is_judged_by_what_is_left_without_it(
     returned: float, left: float, share: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("go1exp.gap.search.search.excess", lambda chi2: chi2)
+    monkeypatch.setattr("go1exp.gap.search.state.excess", lambda chi2: chi2)
     search: Any = SimpleNamespace(first=100.0, select_chi2=left, share_of=lambda term: returned)
     assert Search.removes(search, "torque_delay") == pytest.approx(share, nan_ok=True)
 
@@ -150,15 +150,15 @@ def test_half_of_the_resamples_are_enough_where_the_gap_is_closed(
 
 
 @pytest.mark.parametrize(
-    ("joints", "strained", "left", "sure"),
+    ("joints", "marginal", "left", "sure"),
     [(1, True, -0.05, False), (1, True, -0.15, True), (1, False, -0.05, True), (2, True, -0.05, True)],
     ids=["doubted", "it gains a tenth of the floor", "the tolerances do not suffice", "two joints"],
 )
 def test_one_joint_alone_is_doubted_where_the_tolerances_do_nearly_as_well(
-    joints: int, strained: bool, left: float, sure: bool, monkeypatch: pytest.MonkeyPatch
+    joints: int, marginal: bool, left: float, sure: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("go1exp.gap.search.certainty.excess", lambda chi2: chi2)
-    search: Any = Stub(first=0.0, strained=strained, select_chi2=left)
+    search: Any = Stub(first=0.0, marginal=marginal, select_chi2=left)
     theta = {("coulomb", "bound"): np.full(4, 0.3)}
     assert (doubt(search, "coulomb", theta, JOINTS[:joints], True, BORNE_OUT) == "") is sure
 

@@ -14,7 +14,6 @@ import pytest
 from go1exp.config.schema.registry import ConfigError
 from go1exp.gap import files
 from go1exp.gap.comparison import _last_check, clock_taken, compare, prepare
-from go1exp.gap.data.clocks import beginnings, rows_of, same_rows
 from go1exp.gap.data.cutting import even_clock
 from go1exp.gap.data.windows import splits
 from go1exp.gap.result import ClockChoice, GapResult, GapSettings
@@ -22,7 +21,8 @@ from go1exp.gap.robots.fixed_base import FixedBase
 from go1exp.gap.score.initial_state import rescaled
 from go1exp.gap.score.likelihood import Scorer, grouped
 from go1exp.gap.search import clocks, tolerances
-from go1exp.gap.search.search import Search
+from go1exp.gap.search.clocks import beginnings, rows_of, same_rows
+from go1exp.gap.search.state import Search
 from go1exp.gap.stages.apply import read_as
 from go1exp.gap.stages.explain import explain
 from go1exp.logs.recording import Recording
@@ -172,7 +172,7 @@ def test_too_few_windows_decide_nothing(motions: list[tuple[np.ndarray, ...]]) -
     _, choice = clock_taken(short, pendulum(), QUICK)
     assert choice is not None
     assert not choice.decided
-    assert "stretches of held-out windows could judge" in choice.reason
+    assert "stretches of held-out windows remain" in choice.reason
 
 
 def test_uneven_written_times_are_told() -> None:
@@ -210,12 +210,12 @@ def test_windows_of_one_stretch_count_as_one() -> None:
     """Twelve windows in four stretches: of 2^4 flips 2 are as large, and never fewer however many windows there are."""
     recorded, speeds = np.full(12, 2.0), np.full(12, 1.0)
     rng = np.random.default_rng(0)
-    gain, interval, p = clocks.judged({"recorded": recorded, "speeds": speeds}, np.repeat(np.arange(4), 3), rng)
+    gain, interval, p = clocks.compared({"recorded": recorded, "speeds": speeds}, np.repeat(np.arange(4), 3), rng)
     assert (gain, *interval) == pytest.approx((1.0, 1.0, 1.0))
     assert p == pytest.approx(2 / 16, abs=0.02)
-    gain, interval, p = clocks.judged({"recorded": recorded, "speeds": speeds}, np.arange(12), rng)
+    gain, interval, p = clocks.compared({"recorded": recorded, "speeds": speeds}, np.arange(12), rng)
     assert p < 0.005
-    swapped, (low, high), _ = clocks.judged({"recorded": speeds, "speeds": recorded}, np.arange(12), rng)
+    swapped, (low, high), _ = clocks.compared({"recorded": speeds, "speeds": recorded}, np.arange(12), rng)
     assert (swapped, low, high) == pytest.approx((-1.0, -1.0, -1.0))
 
 

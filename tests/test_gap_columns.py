@@ -95,7 +95,7 @@ def test_columns_that_learn_come_as_far_as_columns_that_stay(hung: State) -> Non
 
 
 def test_a_settled_model_keeps_columns_as_they_were_measured(hung: State) -> None:
-    once = hung.settled(1)
+    once = hung.converged(1)
     np.testing.assert_array_equal(once.table.columns, hung.linear({}, hung.splits.train).columns)
     residual = hung.linear(once.theta, hung.splits.train).residual
     np.testing.assert_allclose(once.table.residual, residual, atol=1e-3 * np.abs(residual).max())
@@ -104,19 +104,19 @@ def test_a_settled_model_keeps_columns_as_they_were_measured(hung: State) -> Non
 def test_a_settled_model_is_as_good_whatever_its_first_columns_were(
     hung: State, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    nominal = replace(hung, terms=()).settled(3)
+    nominal = replace(hung, terms=()).converged(3)
     assert nominal.nominal is not None
     begun = replace(nominal, terms=("coulomb",), theta=dict(THETA))
-    borrows = begun.settled(4)
+    borrows = begun.converged(4)
     monkeypatch.setattr(search_state, "borrowed", None)  # and none is asked for
-    measures = replace(begun, nominal=None).settled(4)
+    measures = replace(begun, nominal=None).converged(4)
     ours, theirs = (float(log_chi2(s.held_out()).mean()) for s in (borrows, measures))
     assert ours == pytest.approx(theirs, abs=0.02)
     assert borrows.theta[FRICTION] == pytest.approx(measures.theta[FRICTION], abs=0.02)
 
 
 def test_what_cannot_come_near_its_rival_is_given_up(hung: State, monkeypatch: pytest.MonkeyPatch) -> None:
-    full = replace(hung, theta=dict(THETA)).settled(2)
+    full = replace(hung, theta=dict(THETA)).converged(2)
     kept = frozenset(("coulomb", j) for j in range(12))
     rounds: list[int] = []
     measured = State.linear
@@ -126,8 +126,8 @@ def test_what_cannot_come_near_its_rival_is_given_up(hung: State, monkeypatch: p
         return measured(self, theta, windows)
 
     monkeypatch.setattr(State, "linear", counted)
-    hopeless = full.keeping(kept).settled(3, rival=full)
+    hopeless = full.keeping(kept).converged(3, rival=full)
     assert not rounds
     assert hopeless.held_out().mean() > 2.0 * full.held_out().mean()
-    again = full.settled(3, rival=full)
+    again = full.converged(3, rival=full)
     assert again.held_out().mean() == pytest.approx(full.held_out().mean(), rel=0.05)

@@ -26,13 +26,13 @@ from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.rows import null, variants
 from go1exp.gap.report import tables
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
-from go1exp.gap.robots.choice import robot_of
 from go1exp.gap.robots.description import parse_model
+from go1exp.gap.robots.fixed_base import robot_of
 from go1exp.gap.robots.go1 import StandingGo1, SuspendedGo1
-from go1exp.gap.score.initial_state import settled
+from go1exp.gap.score.initial_state import converged
 from go1exp.gap.search import profile_likelihood, tolerances
 from go1exp.gap.search.screen import Motion, library
-from go1exp.gap.search.search import Search, begun
+from go1exp.gap.search.state import Search, begun
 from go1exp.gap.search.stepwise import alone
 from go1exp.gap.stages import apply
 from go1exp.gap.stages.explain import explain
@@ -236,7 +236,7 @@ def search_in(recordings: tuple[Recording, ...], config: RobotConfig, contact: C
     machine, ready = prepare(recordings, SuspendedGo1(config, contact=contact), QUICK)
     windows = machine.windows(ready)
     replayer = machine.replayer(windows, np.tile([1.0, 0, 0, 0], (len(windows), 1)), 512, 1)
-    score, _ = settled(replayer, 0.001, 0.00015)
+    score, _ = converged(replayer, 0.001, 0.00015)
     rng = np.random.default_rng(0)
     parts = splits([r.meta for r in recordings], score.windows.episode, 0.2, rng)
     return begun(score, parts, QUICK, 0.001, rng)

@@ -17,8 +17,7 @@ from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import Table, unbiased_grams
 from go1exp.gap.search import thresholds
 from go1exp.gap.search.certainty import opposite, resampled_values, semidefinite
-from go1exp.gap.search.search import begun
-from go1exp.gap.search.state import State
+from go1exp.gap.search.state import State, begun
 from go1exp.sim.effects.tolerances import DECLARED
 from go1exp.sim.task import parse_parts
 from tests.laboratory import recorded
@@ -40,7 +39,7 @@ def delays(monkeypatch: pytest.MonkeyPatch, finer: int) -> tuple[np.ndarray, np.
     search = begun(comparison.scorer, parts, comparison.settings, comparison.dt, rng)
     key = ("command_delay", "delay")
     theta: Theta = {key: np.full(12, HIDDEN_S)}
-    state = replace(search.state, terms=("command_delay",), theta=theta).settled(1)
+    state = replace(search.state, terms=("command_delay",), theta=theta).converged(1)
     fitted, drawn = resampled_values(replace(search, state=state))
     return fitted[key], drawn[key]
 

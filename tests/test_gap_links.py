@@ -125,8 +125,8 @@ def test_a_load_is_judged_by_the_answer_of_the_loaded_leg_to_its_initial_state(t
     values = {
         ("point_load", k): np.array([0.0, 0.0, v["calf"]] if isinstance(v, dict) else [v] * 3) for k, v in load.items()
     }
-    assert comparison.scorer.renewed is not None
-    scorers = comparison.scorer, comparison.scorer.renewed(values)
+    assert comparison.scorer.updated is not None
+    scorers = comparison.scorer, comparison.scorer.updated(values)
     plain, own = (scores(s, [values], comparison.everything, comparison.dt)[0].mean() for s in scorers)
     assert own == pytest.approx(1.0, abs=0.1)
     assert plain > 1.5

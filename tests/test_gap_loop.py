@@ -11,9 +11,8 @@ import pytest
 
 from go1exp.cli import main
 from go1exp.gap.design.choice import Worth
-from go1exp.gap.design.plan import Attitude, Design, DesignError, Used
+from go1exp.gap.design.plan import Attitude, Design, DesignError, DesignSettings, Used
 from go1exp.gap.design.rehearsal import Rehearsal
-from go1exp.gap.design.settings import DesignSettings
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
 from go1exp.gap.stages import loop as stage_loop
 from go1exp.gap.stages.next import NextResult, Verdict

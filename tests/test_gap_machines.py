@@ -25,13 +25,12 @@ from go1exp.gap.data.prepare import MOST_WINDOWS, clock_of_speeds, noise_in_time
 from go1exp.gap.data.windows import averaged
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import GapSettings
-from go1exp.gap.robots.choice import robot_of
 from go1exp.gap.robots.description import ModelConfig, parse_model
-from go1exp.gap.robots.fixed_base import FixedBase
+from go1exp.gap.robots.fixed_base import FixedBase, robot_of
 from go1exp.gap.robots.go1 import SuspendedGo1
 from go1exp.gap.search import tolerances
 from go1exp.gap.search.certainty import resampled_values
-from go1exp.gap.search.search import LastCheck, begun
+from go1exp.gap.search.state import LastCheck, begun
 from go1exp.gap.stages.explain import explain
 from go1exp.logs.importers import import_recordings
 from go1exp.logs.recording import Meta, Recording, joint_channel
@@ -419,7 +418,7 @@ def test_a_value_that_is_held_has_no_interval() -> None:
     found = compare(logs, robot, QUICK)
     search = begun(found.scorer, found.split(rng), found.settings, found.dt, rng)
     theta: Theta = {("load_friction", name): np.array([value]) for name, value in hidden.items()}
-    state = dataclasses.replace(search.state, terms=("load_friction",), theta=theta).settled(1)
+    state = dataclasses.replace(search.state, terms=("load_friction",), theta=theta).converged(1)
     aliases = {"load_friction": ("load_friction",)}
     search = dataclasses.replace(search, state=state, aliases=aliases, select_chi2=state.held_out())
     fitted, drawn = resampled_values(search)

@@ -19,10 +19,19 @@ from go1exp.cli.gap_next import text
 from go1exp.config.schema.registry import bind
 from go1exp.gap import files as gap_files
 from go1exp.gap.comparison import Comparison, compare
-from go1exp.gap.design.choice import ENOUGH, Judge, Pair, Worth, choose, power
-from go1exp.gap.design.plan import Attitude, Design, DesignError, Limits, library, limits_of, neighbours
+from go1exp.gap.design.choice import ENOUGH, Evaluator, Pair, Worth, choose, power
+from go1exp.gap.design.plan import (
+    Attitude,
+    Design,
+    DesignError,
+    DesignSettings,
+    Limits,
+    Safety,
+    library,
+    limits_of,
+    neighbours,
+)
 from go1exp.gap.design.rehearsal import Stage, write
-from go1exp.gap.design.settings import DesignSettings, Safety
 from go1exp.gap.replay.rows import Theta, variants
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
 from go1exp.gap.robots.description import ModelConfig
@@ -156,9 +165,9 @@ def test_worth_is_what_a_fit_of_the_rival_to_the_noise_free_truth_leaves(
     monkeypatch.setattr(tolerances, "nominal", lambda machine: ("viscous", "armature"))
     comparison = hand(arm, ("gait", "multisine"))
     both = pair("coulomb", "viscous", "bound", 0.1)
-    judge = Judge(both, comparison.scorer, SETTINGS, comparison.dt)
-    found = judge.worth(judge.at_hand)
-    state, layout = judge.state, judge.layout
+    evaluator = Evaluator(both, comparison.scorer, SETTINGS, comparison.dt)
+    found = evaluator.worth(evaluator.at_hand)
+    state, layout = evaluator.state, evaluator.layout
     assert state.fitted is not None
     limits = tolerances.bounds(layout, state.fitted.probes, {}, state.may)
     windows, scorer = state.splits.train, state.scorer
@@ -177,7 +186,7 @@ def test_worth_is_what_a_fit_of_the_rival_to_the_noise_free_truth_leaves(
 
     fit = least_squares(left, np.zeros(layout.size), bounds=(limits.low - 1e-9, limits.high), x_scale=1 / root)
     data = fit.fun[: -layout.size]
-    assert found.distance == pytest.approx(judge.at_hand.weight * float(data @ data), rel=0.05)
+    assert found.distance == pytest.approx(evaluator.at_hand.weight * float(data @ data), rel=0.05)
     assert found.distance > 100
     assert 0.0 < found.imitated < 1.0
 
@@ -185,11 +194,11 @@ def test_worth_is_what_a_fit_of_the_rival_to_the_noise_free_truth_leaves(
 def test_the_rival_that_is_the_truth_leaves_nothing(arm: FixedBase, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tolerances, "nominal", lambda machine: ("viscous", "kd_scale"))
     comparison = hand(arm)
-    judge = Judge(pair("viscous", "kd_scale", "damping", 0.2), comparison.scorer, SETTINGS, comparison.dt)
-    worth = judge.worth(judge.at_hand)
+    evaluator = Evaluator(pair("viscous", "kd_scale", "damping", 0.2), comparison.scorer, SETTINGS, comparison.dt)
+    worth = evaluator.worth(evaluator.at_hand)
     assert worth.imitated > 0.999  # kd of 0.3 and damping of 0.2: the same torque
     assert worth.power < 0.1
-    assert float(judge.state.theta["kd_scale", "scale"][0]) == pytest.approx(1 + 0.2 / 0.3, rel=0.05)
+    assert float(evaluator.state.theta["kd_scale", "scale"][0]) == pytest.approx(1 + 0.2 / 0.3, rel=0.05)
 
 
 # ---------------------------------------------------------------------- designs
@@ -199,11 +208,11 @@ def chosen(
     comparison: Comparison, both: Pair, attitudes: Sequence[Attitude], **given: Any
 ) -> tuple[Worth, Worth, Any, Stage]:
     """Return the worth of the recordings at hand, with the design, the choice, and the stage."""
-    judge = Judge(both, comparison.scorer, comparison.settings, 2 * comparison.dt)
+    evaluator = Evaluator(both, comparison.scorer, comparison.settings, 2 * comparison.dt)
     here = stage(comparison, both.theta)
     settings = DesignSettings(seconds=3.0, designs=12, refine=1, **given)
-    choice = choose(here, [judge], attitudes, settings, lambda what, share: None)
-    return judge.worth(judge.at_hand), choice.worths[0], choice, here
+    choice = choose(here, [evaluator], attitudes, settings, lambda what, share: None)
+    return evaluator.worth(evaluator.at_hand), choice.worths[0], choice, here
 
 
 @pytest.mark.slow("go1exp/gap/design/", "go1exp/gap/stages/next.py", "tests/")
@@ -217,7 +226,7 @@ def test_friction_and_kd_are_told_apart_by_another_kd_and_by_nothing_else(
     before, same, choice, _ = chosen(comparison, both, FIXED, gains=((1.0, 1.0),))
     assert choice.best is None
     assert same.power < 0.1
-    why = stage_next.reason(Judge(both, comparison.scorer, SETTINGS, 2 * comparison.dt), same, 0, DesignSettings())
+    why = stage_next.reason(Evaluator(both, comparison.scorer, SETTINGS, 2 * comparison.dt), same, 0, DesignSettings())
     assert "kd_scale imitates all but" in why
     before, after, choice, here = chosen(comparison, both, FIXED, gains=((1.0, 1.0), (1.0, 2.0), (1.0, 3.0)))
     assert before.power < 0.1

@@ -256,7 +256,7 @@ class Settled:
         assert (name,) == self.terms
         return Settled((instead,), *self.others[instead])
 
-    def settled(self, steps: int) -> Settled:
+    def converged(self, steps: int) -> Settled:
         return self
 
     def held_out(self, theta: Theta | None = None) -> np.ndarray:

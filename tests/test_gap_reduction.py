@@ -13,7 +13,7 @@ import pytest
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import Candidate
 from go1exp.gap.search import reduction, tolerances
-from go1exp.gap.search.search import Search
+from go1exp.gap.search.state import Search
 from go1exp.robot import JOINTS
 from go1exp.sim.effects.tolerances import DECLARED
 
@@ -27,7 +27,7 @@ class Known:
     chi2: Callable[[tuple[str, ...]], float]
     terms: tuple[str, ...]
     theta: Theta
-    loosened: tuple[str, ...] = ()
+    relaxed: tuple[str, ...] = ()
     worse: Callable[[frozenset[tuple[str, int]]], np.ndarray] | None = None
     kept: frozenset[tuple[str, int]] = frozenset()
     machine: Any = field(
@@ -35,7 +35,7 @@ class Known:
     )
     tolerances: Any = DECLARED
 
-    def settled(self, rounds: int, rival: Known | None = None) -> Known:
+    def converged(self, rounds: int, rival: Known | None = None) -> Known:
         return self
 
     def without(self, term: str, instead: str = "") -> Known:
@@ -89,7 +89,7 @@ def test_friction_that_is_equal_both_ways_is_dry_friction(
 
 
 @pytest.mark.parametrize(
-    ("strained", "alias", "name"),
+    ("marginal", "alias", "name"),
     [
         (False, (), "coulomb"),
         (True, (), "coulomb"),
@@ -98,12 +98,12 @@ def test_friction_that_is_equal_both_ways_is_dry_friction(
     ],
 )
 def test_a_simpler_effect_that_is_named_in_the_set_of_a_small_gap_takes_no_place(
-    strained: bool, alias: tuple[str, ...], name: str
+    marginal: bool, alias: tuple[str, ...], name: str
 ) -> None:
     friction = {("asymmetric_friction", way): np.full(12, 0.4) for way in ("forward", "backward")}
     asked = search(Known(lambda terms: 1.0, ("asymmetric_friction",), friction))
     aliases = {"asymmetric_friction": ("asymmetric_friction", *alias)}
-    asked = replace(asked, strained=strained, aliases=aliases)
+    asked = replace(asked, marginal=marginal, aliases=aliases)
     asked = reduction.simplify(asked)
     assert asked.state.terms == (name,)
 

@@ -24,8 +24,8 @@ from go1exp.gap.score.likelihood import gram
 from go1exp.gap.score.linear import Layout, predicted
 from go1exp.gap.search import significance, stepwise, thresholds, tolerances
 from go1exp.gap.search.fit import Model, scores
-from go1exp.gap.search.search import Search
 from go1exp.gap.search.significance import max_t
+from go1exp.gap.search.state import Search
 from go1exp.gap.search.tolerances import Bounds, Freedom, solve
 from go1exp.gap.stages.explain import explain
 from go1exp.logs.record import simulate
@@ -284,12 +284,12 @@ def test_few_windows_are_enough_for_what_removes_most_of_a_gap(
 def test_what_strains_most_is_tried_with_its_rivals() -> None:
     relief = {"armature": 900.0, "link_mass": 200.0, "strength": 100.0}
     values = 900.0 / (2.0 * thresholds.ACTIVE_BOUND)
-    assert tolerances.straining(relief, values, []) == ["armature"]
-    assert tolerances.straining(relief, 3.0 * values, []) == []
-    assert tolerances.straining(relief, values, ["armature"]) == []  # 200 is too little
-    assert tolerances.straining(relief | {"link_mass": 601.0}, values, []) == ["armature", "link_mass"]
-    assert tolerances.straining(relief | {"armature": 3000.0, "link_mass": 900.0}, values, []) == ["armature"]
-    assert tolerances.straining({}, values, []) == []
+    assert tolerances.active_bounds(relief, values, []) == ["armature"]
+    assert tolerances.active_bounds(relief, 3.0 * values, []) == []
+    assert tolerances.active_bounds(relief, values, ["armature"]) == []  # 200 is too little
+    assert tolerances.active_bounds(relief | {"link_mass": 601.0}, values, []) == ["armature", "link_mass"]
+    assert tolerances.active_bounds(relief | {"armature": 3000.0, "link_mass": 900.0}, values, []) == ["armature"]
+    assert tolerances.active_bounds({}, values, []) == []
 
 
 @pytest.mark.parametrize(("third", "expected"), [(1.0, ["viscous", "kd_scale"]), (300.0, [])])
@@ -336,14 +336,14 @@ def test_where_little_is_left_and_nothing_alone_removes_it_what_strains_a_tolera
     monkeypatch.setattr(stepwise, "screened_by", lambda search: [])
     monkeypatch.setattr(stepwise, "fitted_candidates", lambda search, screened: ["screened"])
     monkeypatch.setattr(stepwise, "at_active_bounds", lambda search, screened: (search, ["leaning"]))
-    monkeypatch.setattr(stepwise, "judged", judge)
+    monkeypatch.setattr(stepwise, "held_out_test", judge)
     monkeypatch.setattr(stepwise, "accept", lambda search, accepted: (search, accepted is model))
-    state: Any = SimpleNamespace(terms=(), loosened=(), train_chi2=None, settings=GapSettings())
+    state: Any = SimpleNamespace(terms=(), relaxed=(), train_chi2=None, settings=GapSettings())
     chi2 = np.full((8, 4), 1.0 + left)
     search = Search(state, np.random.default_rng(0), lambda what, share: None, chi2, signal={"coulomb": 1.0})
     search, accepted = stepwise.advance(search)
     assert judged == asked
-    assert (accepted, search.strained) == (asked[-1][1], asked[-1][1])  # a strained term must be clear of doubt
+    assert (accepted, search.marginal) == (asked[-1][1], asked[-1][1])  # a strained term must be clear of doubt
 
 
 @pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")

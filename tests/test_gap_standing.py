@@ -21,12 +21,11 @@ from go1exp.gap.replay.walking import StandingReplayer
 from go1exp.gap.result import GapSettings
 from go1exp.gap.robots.go1 import StandingGo1, SuspendedGo1
 from go1exp.gap.score.angle_errors import ON_FEET, REGIMES, localise
-from go1exp.gap.score.initial_state import settled
+from go1exp.gap.score.initial_state import converged
 from go1exp.gap.score.likelihood import Scorer, excess
 from go1exp.gap.search import profile_likelihood, reduction, single_cause
 from go1exp.gap.search.fit import residuals
-from go1exp.gap.search.search import Search, begun
-from go1exp.gap.search.state import State
+from go1exp.gap.search.state import Search, State, begun
 from go1exp.gap.search.stepwise import alone, run
 from go1exp.gap.stages.explain import explain
 from go1exp.logs.recording import VECTORS, Recording
@@ -134,7 +133,7 @@ def test_the_replayed_imu_says_what_the_engine_s_own_sensors_say() -> None:
 def scored() -> tuple[Scorer, np.ndarray]:
     """Return the scorer of a robot as the model has it, and its residuals."""
     replayer, dt = ready(*recorded("excitation=[squat,gait]"))
-    score, _ = settled(replayer, dt, 0.00015)
+    score, _ = converged(replayer, dt, 0.00015)
     return score, residuals(score, [{}], np.arange(len(score.windows)), dt)[0]
 
 
@@ -192,7 +191,7 @@ def search_in(*overrides: str) -> Search:
     """Return a search that has not begun, in a squatting and falling robot's recordings."""
     config, recordings = recorded("excitation=[squat,drop]", "seeds=[0,1]", *overrides)
     replayer, dt = ready(config, recordings)
-    score, _ = settled(replayer, dt, 0.00015)
+    score, _ = converged(replayer, dt, 0.00015)
     rng = np.random.default_rng(0)
     parts = splits([r.meta for r in recordings], score.windows.episode, 0.2, rng)
     return begun(score, parts, QUICK, dt, rng)
@@ -215,7 +214,7 @@ def test_a_payload_is_named_although_the_tolerances_of_the_joints_could_carry_it
 def test_a_payload_on_a_walking_robot_fits_best_by_first_states_of_its_own() -> None:
     config, recordings = recorded("excitation=[gait]", "seeds=[0,1]", "+effect.payload.mass=2.0")
     replayer, dt = ready(config, recordings)
-    score, _ = settled(replayer, dt, 0.00015)
+    score, _ = converged(replayer, dt, 0.00015)
     everything, first = np.arange(len(score.windows)), profile_likelihood.begun(score, dt)
     assert first.windows is replayer.windows
     found, _ = profile_likelihood.fitted(first, sizes("payload"), everything, dt)
@@ -259,7 +258,7 @@ def test_drives_that_are_all_a_little_weak_are_no_payload_and_within_tolerances(
         p = search.state.tolerances.param(key)
         assert np.ptp(values) == 0.0
         assert np.abs(values - p.null).max() <= p.tolerance * (1.0 + 1e-9)
-    state = replace(search.state, theta=search.within).renewed()
+    state = replace(search.state, theta=search.within).updated()
     assert excess(state.held_out()) < 0.2 * plain
 
 
@@ -337,9 +336,9 @@ def test_the_fit_within_tolerances_begins_at_what_is_off_alike_where_nothing_alo
         starts.append(self.theta)
         raise Stopped
 
-    monkeypatch.setattr(single_cause, "cause", lambda search, judged: (search, single_cause.Sought(None, within)))
-    monkeypatch.setattr(State, "renewed", lambda self: self)
-    monkeypatch.setattr(State, "settled", stopped)
+    monkeypatch.setattr(single_cause, "cause", lambda search, test: (search, single_cause.Sought(None, within)))
+    monkeypatch.setattr(State, "updated", lambda self: self)
+    monkeypatch.setattr(State, "converged", stopped)
     for settings in (QUICK, replace(QUICK, calibrate=False)):
         with pytest.raises(Stopped):
             run(begun(score, parts, settings, 0.002, rng))

@@ -22,8 +22,8 @@ from go1exp.gap import files
 from go1exp.gap.answer import why_withdrawn
 from go1exp.gap.report import tables, text, write_report
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
-from go1exp.gap.robots.choice import robot_of
 from go1exp.gap.robots.description import parse_model
+from go1exp.gap.robots.fixed_base import robot_of
 from go1exp.gap.robots.go1 import suspended
 from go1exp.gap.search import candidates, tolerances
 from go1exp.gap.stages.apply import prove, write
@@ -59,7 +59,7 @@ def answer(**changes: Any) -> GapResult:
 
 
 @pytest.mark.parametrize(
-    ("interval", "strained", "withdrawn"),
+    ("interval", "marginal", "withdrawn"),
     [
         ({JOINT: (0.003, 0.005)}, True, False),  # a tolerance of rotor inertia is 0.001 kg m2
         ({JOINT: (0.0008, 0.003)}, True, True),
@@ -68,11 +68,11 @@ def answer(**changes: Any) -> GapResult:
     ],
 )
 def test_where_the_tolerances_suffice_an_interval_must_lie_beyond_them(
-    interval: dict[str, tuple[float, float]], strained: bool, withdrawn: bool
+    interval: dict[str, tuple[float, float]], marginal: bool, withdrawn: bool
 ) -> None:
     assert DECLARED.param(ADDED).tolerance == 0.001
     (named,) = answer().named
-    search: Any = SimpleNamespace(strained=strained, settings=GapSettings(), state=SimpleNamespace(tolerances=DECLARED))
+    search: Any = SimpleNamespace(marginal=marginal, settings=GapSettings(), state=SimpleNamespace(tolerances=DECLARED))
     why = why_withdrawn(search, [replace(named, interval={"added": interval})], first=0.05)
     assert bool(why) == withdrawn
 

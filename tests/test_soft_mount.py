@@ -24,7 +24,7 @@ from go1exp.config.compose import compose
 from go1exp.config.schema.registry import Term, bind
 from go1exp.gap.data.prepare import Ready
 from go1exp.gap.replay.replayer import LEVEL, Replayer
-from go1exp.gap.replay.rows import Rows, Theta, bolted, mounted, variants
+from go1exp.gap.replay.rows import Rows, Theta, mounted, on_fixed_base, variants
 from go1exp.gap.result import GapSettings
 from go1exp.gap.robots.description import ModelConfig, parse_model
 from go1exp.gap.robots.fixed_base import FixedBase
@@ -260,7 +260,7 @@ def test_rows_without_compliance_are_simulated_bolted() -> None:
     values = {("soft_mount", "roll"): roll, ("soft_mount", "damping"): shape, ("coulomb", "bound"): other}
     rows = Rows(np.arange(3), values)
     assert mounted(rows).tolist() == [False, True, False]
-    assert list(bolted(rows).values) == [("coulomb", "bound")]
+    assert list(on_fixed_base(rows).values) == [("coulomb", "bound")]
 
 
 def test_a_free_trunk_has_no_mount() -> None:

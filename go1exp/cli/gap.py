@@ -116,7 +116,7 @@ def _task(container: dict[str, Any]) -> int:
     if settings.stage in ("all", "replay", "explain", "apply"):
         writable(settings.out)
 
-    from go1exp.gap.robots.choice import robot_of
+    from go1exp.gap.robots.fixed_base import robot_of
 
     robot = robot_of(parts["model"], parts["robot"], contact=parts.get("contact"))
     if settings.stage == "check":
@@ -152,7 +152,7 @@ def refuse_unknown(effects: Sequence[str]) -> None:
 
 def _view(settings: GapVerb, parts: dict[str, Any], where: tuple[str, int]) -> int:
     """Show the answer in the browser."""
-    from go1exp.gap.robots.choice import robot_of
+    from go1exp.gap.robots.fixed_base import robot_of
 
     gap(Path(settings.out), robot_of(parts["model"], parts["robot"]), parts["robot"], where)
     return 0

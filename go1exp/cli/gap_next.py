@@ -15,7 +15,7 @@ from go1exp.cli.record import RIG, _motions
 from go1exp.cli.verbs import command
 from go1exp.config.schema import settings as schema
 from go1exp.config.schema.registry import ConfigError, FolderName
-from go1exp.gap.design.settings import DesignSettings
+from go1exp.gap.design.plan import DesignSettings
 from go1exp.gap.result import GapSettings
 from go1exp.logs.record.plan import RecordingConfig
 
@@ -89,7 +89,7 @@ def _next(container: dict[str, Any]) -> int:
     answer = files.load(out)
 
     from go1exp.gap.design.plan import DesignError
-    from go1exp.gap.robots.choice import robot_of
+    from go1exp.gap.robots.fixed_base import robot_of
     from go1exp.gap.stages.next import design
 
     robot = robot_of(parts["model"], parts["robot"])
@@ -121,9 +121,13 @@ def save(result: NextResult, out: Path) -> None:
 
 def text(result: NextResult, file: Path) -> str:
     """Return a result as lines for people; ``file`` is where its targets are."""
-    lines = [f"settled by the logs at hand: {', '.join(result.settled)}"] if result.settled else []
+    lines = (
+        [f"already distinguishable by the logs at hand: {', '.join(result.distinguishable)}"]
+        if result.distinguishable
+        else []
+    )
     if result.verdict == "nothing left":
-        return "\n".join([*lines, "nothing is left to be told apart: no further recording is needed for the answer"])
+        return "\n".join([*lines, "nothing is left to distinguish: no further recording is needed for the answer"])
     best = result.best
     if best is None:
         lines.append(f"not separable: none of {result.tried} designs ({result.beyond} more beyond a limit) tells apart")
@@ -196,7 +200,7 @@ def _loop(container: dict[str, Any]) -> int:
     if problems:
         raise ConfigError(problems)
 
-    from go1exp.gap.robots.choice import robot_of
+    from go1exp.gap.robots.fixed_base import robot_of
     from go1exp.gap.stages.loop import loop, table
     from go1exp.logs.record import plan
     from go1exp.logs.record.simulate import Rig

@@ -17,7 +17,7 @@ _HOME = {
     "compare": "comparison",
     "Comparison": "comparison",
     "NotComparable": "comparison",
-    "robot_of": "robots.choice",
+    "robot_of": "robots.fixed_base",
     "GapResult": "result",
     "GapSettings": "result",
 }

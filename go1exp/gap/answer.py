@@ -17,24 +17,24 @@ from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score import angle_errors
 from go1exp.gap.score.likelihood import excess, removed
 from go1exp.gap.search import reduction, thresholds, tolerances
-from go1exp.gap.search.candidates import beyond, bounded, deviation, inaudible
+from go1exp.gap.search.candidates import beyond, bounded, deviation, unexcited_rows
 from go1exp.gap.search.certainty import beside_a_gap, doubt, resampled_values, widened
 from go1exp.gap.search.fit import residuals
-from go1exp.gap.search.search import LastCheck, Search
+from go1exp.gap.search.state import LastCheck, Search
 from go1exp.sim.effects.base import Param
 from go1exp.sim.effects.tolerances import Tolerances, declared, sizes
 
 
 def can_stand(robot: Robot) -> bool:
-    """Whether a robot that these recordings show off its feet has any that a recording could show it on."""
+    """Whether a suspended robot has feet on which another recording could show it."""
     return not (robot.on_ground or isinstance(robot, FixedBase))
 
 
 def not_excited(signal: Mapping[str, float], held: bool = True) -> dict[str, str]:
     """Return effects that these data cannot show, and the excitation that would; ``held``: a trunk is that has feet."""
-    silent = [effect for effect, loud in signal.items() if loud < thresholds.NOT_EXCITED]
+    unexcited = [effect for effect, level in signal.items() if level < thresholds.NOT_EXCITED]
     unfelt = [effect for effect in members("effect") if held and tolerances.identification(effect).needs_ground]
-    return {effect: tolerances.identification(effect).excitation for effect in (*silent, *unfelt)}
+    return {effect: tolerances.identification(effect).excitation for effect in (*unexcited, *unfelt)}
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def concluded(search: Search, warnings: list[str]) -> tuple[Search, Answer]:
             warnings.append(f"On windows kept for a last check the error is {1 + confirmed:.3g} times the floor.")
     unsure = {n.effect for n in named if n.status != "certified"}
     certain = {key: value for key, value in theta.items() if key[0] not in unsure}
-    reached["written"] = excess(search.state.finer().held_out(certain, search.splits.judged))
+    reached["written"] = excess(search.state.finer().held_out(certain, search.splits.evaluated))
     return search, Answer(verdict, named, theta, reached, removed(first, final) if named else math.nan, within)
 
 
@@ -109,7 +109,7 @@ def why_withdrawn(search: Search, named: Sequence[NamedEffect], first: float) ->
 
     One effect of which that is sure keeps those that were fitted beside it.
     """
-    if search.strained and not any(beyond_doubt(n, search.state.tolerances) for n in named):
+    if search.marginal and not any(beyond_doubt(n, search.state.tolerances) for n in named):
         return "no interval lies beyond its tolerance"
     if first <= search.settings.adequate and not any(n.status == "certified" for n in named):
         return " and ".join(dict.fromkeys(n.reason for n in named))
@@ -265,7 +265,7 @@ def decide(search: Search, named: Sequence[NamedEffect], final: float, accepted:
     """Return the verdict.
 
     Terms none of which is certain explain nothing, however near they bring the model to these logs: so near come some
-    to a robot that has none of them. Without resamples (``search.bootstraps=0``) nobody has asked how certain they are.
+    to a robot that has none of them. Without resamples (``search.bootstraps=0``) their certainty is unknown.
 
     Args:
         search: that is done.
@@ -274,18 +274,18 @@ def decide(search: Search, named: Sequence[NamedEffect], final: float, accepted:
         accepted: whether what remains is within what the user does not care about.
     """
     settings, first = search.settings, search.first
-    loud = [effect for effect, s in search.signal.items() if s >= thresholds.NOT_EXCITED]
+    level = [effect for effect, s in search.signal.items() if s >= thresholds.NOT_EXCITED]
     if named:
         certain = not settings.bootstraps or any(n.status == "certified" for n in named)
         return "explained" if accepted or (certain and final <= settings.adequate) else "partly explained"
     if first > settings.adequate and not accepted:
         return "unexplained"
-    return "not excited" if len(loud) < 0.5 * len(search.signal) else "no gap"
+    return "not excited" if len(level) < 0.5 * len(search.signal) else "no gap"
 
 
 def evidence(search: Search) -> tuple[Candidate, ...]:
     """Return the candidates, best first, with those that the data cannot show."""
-    quiet = inaudible(search.signal, thresholds.NOT_EXCITED, [c.effect for c in search.candidates])
+    quiet = unexcited_rows(search.signal, thresholds.NOT_EXCITED, [c.effect for c in search.candidates])
     accepted = {c.effect for c in search.candidates if c.status == "accepted"} - set(search.state.terms)
     kept = [
         replace(c, status="rejected", reason="dropped: the other terms do as well without it")

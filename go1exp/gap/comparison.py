@@ -9,7 +9,6 @@ from typing import get_args
 import numpy as np
 
 from go1exp.base.errors import Expected
-from go1exp.gap.data.clocks import rows_of, same_rows
 from go1exp.gap.data.cutting import Place
 from go1exp.gap.data.prepare import Ready, too_coarse
 from go1exp.gap.data.windows import Splits, Windows, splits, stretches
@@ -20,7 +19,7 @@ from go1exp.gap.robots.go1 import suspended
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score.initial_state import measured, repeatability
 from go1exp.gap.score.likelihood import Scorer
-from go1exp.gap.search.clocks import OF_CLOCK, Contestant, contest, details
+from go1exp.gap.search.clocks import OF_CLOCK, Contestant, contest, details, rows_of, same_rows
 from go1exp.logs.audit import audit, clock_flaws
 from go1exp.logs.recording import Recording, RecordingError
 from go1exp.robot.config import RobotConfig
@@ -29,7 +28,7 @@ Progress = Callable[[str, float], None]
 """Called with what is being done, and which share of all is finished."""
 
 FEWEST_WINDOWS = 8
-"""Windows below which nothing is judged."""
+"""Windows below which nothing is tested."""
 
 FEWEST_RECORDINGS = 3
 """Recordings that must remain if others are left out."""
@@ -246,9 +245,9 @@ def _compared_clocks(
         return replace(default, taken=taken, reason=reason)
     episode = windows["recorded"].episode
     parts = splits([r.meta for r in written], episode, 0.0, np.random.default_rng(settings.seed))
-    judging = len(np.unique(stretches(episode)[np.concatenate([parts.train, parts.select])]))
-    if judging < FEWEST_STRETCHES:
-        reason = f"only {judging} stretches of held-out windows could judge, and {FEWEST_STRETCHES} are needed"
+    tested = len(np.unique(stretches(episode)[np.concatenate([parts.train, parts.select])]))
+    if tested < FEWEST_STRETCHES:
+        reason = f"only {tested} stretches of held-out windows remain, and {FEWEST_STRETCHES} are needed"
         return replace(default, reason=reason)
     sides: dict[Clock, Contestant] = {}
     for name in names:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any, get_args
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
@@ -15,19 +16,7 @@ from pydantic import TypeAdapter, ValidationError
 from go1exp.base.files import write_json
 from go1exp.config.schema.physics import ContactConfig, read_contact
 from go1exp.config.schema.registry import Expected
-from go1exp.gap.result import (
-    EXIT_CODES,
-    AngleErrors,
-    Candidate,
-    Clock,
-    ClockChoice,
-    Floors,
-    GapResult,
-    GapSettings,
-    Localisation,
-    NamedEffect,
-    Overlay,
-)
+from go1exp.gap.result import GapResult, GapSettings
 
 RESULT = "verdict.json"
 """Name of the file in the output folder."""
@@ -82,29 +71,8 @@ def load(folder: Path) -> GapResult:
 
 def from_dict(plain: Mapping[str, Any]) -> GapResult:
     """Turn what ``GapResult.as_dict`` returned, and JSON kept, into a result; None is NaN where a number belongs."""
-    known = {f.name for f in fields(GapResult)}
-    values = {key: value for key, value in plain.items() if key in known}
-    values["named"] = tuple(_named(item) for item in plain["named"])
-    values["candidates"] = tuple(_candidate(item) for item in plain["candidates"])
-    if plain["verdict"] not in EXIT_CODES:
-        raise ValueError(f"verdict {plain['verdict']!r}")
-    values["floors"] = None if plain["floors"] is None else _floors(plain["floors"])
-    values["errors"] = _errors(plain.get("errors"))  # older results have none
-    values["before"], values["after"] = (_localisation(plain[key]) for key in ("before", "after"))
-    values["overlays"] = tuple(_overlay(item) for item in plain["overlays"])
-    values["waterfall"] = tuple((str(label), _number(value)) for label, value in plain["waterfall"])
-    for name in ("excess", "box"):
-        values[name] = _numbers(plain[name])
-    # Results of older versions call it bags.
-    values["bootstrap_share"] = _numbers(plain["bags"] if "bags" in plain else plain["bootstrap_share"])
-    values["tolerances"] = _numbers(plain.get("tolerances", {}))  # of an older version: the declared ones
-    values["contact"] = _contact(plain.get("contact"))
-    values["clock"] = _clock(plain.get("clock"))  # older results have none
-    for name in ("closed", "seconds"):
-        values[name] = _number(plain[name])
-    for name in ("advice", "warnings"):
-        values[name] = tuple(plain[name])
-    return GapResult(**values)
+    result: GapResult = _read(GapResult, plain, "")
+    return result
 
 
 def search_of(result: GapResult) -> GapSettings:
@@ -121,85 +89,38 @@ def search_of(result: GapResult) -> GapSettings:
     return kept
 
 
-def _number(value: float | None) -> float:
-    return math.nan if value is None else float(value)
+NOT_IN_OLDER = ("errors", "tolerances", "contact", "clock", "share", "within")
+"""Fields that results of older versions do not have."""
 
 
-def _numbers(plain: Any) -> Any:
-    """Put NaN for None in nested lists and mappings of numbers."""
-    if isinstance(plain, Mapping):
-        return {key: _numbers(value) for key, value in plain.items()}
-    return [_numbers(value) for value in plain] if isinstance(plain, list) else _number(plain)
-
-
-def _errors(item: Mapping[str, Any] | None) -> AngleErrors | None:
-    if item is None:
-        return None
-    pairs = {name: {k: _pair(v) for k, v in item[name].items()} for name in ("by_joint", "by_episode")}
-    numbers = {name: _number(item[name]) for name in ("removed", "worse")}
-    within = _pair(item["within"]) if item.get("within") else None  # older results have none
-    return AngleErrors(**{**item, **numbers, **pairs, "median": _pair(item["median"]), "within": within})
-
-
-def _contact(item: Mapping[str, Any] | None) -> ContactConfig | None:
-    """Return the contact of a result; older ones have none."""
-    contact = None if item is None else read_contact(item)
-    if item is not None and contact is None:
-        raise ValueError(f"contact {item!r}")
-    return contact
-
-
-def _clock(item: Mapping[str, Any] | None) -> ClockChoice | None:
-    if item is None:
-        return None
-    if item["taken"] not in get_args(Clock):
-        raise ValueError(f"clock.taken {item['taken']!r}")
-    numbers = {name: _number(item[name]) for name in ("gain", "p", "nominal_gain", "nominal_p")}
-    tables = {name: _numbers(item[name]) for name in ("nominal_errors", "errors")}
-    pairs = {name: _pair(item[name]) for name in ("steps", "interval")}
-    rates = {name: _pair(value) for name, value in item["rate_hz"].items()}
-    terms = {name: tuple(value) for name, value in item["terms"].items()}
-    return ClockChoice(**{**item, **numbers, **tables, **pairs, "rate_hz": rates, "terms": terms})
-
-
-def _pair(item: Sequence[float | None]) -> tuple[float, float]:
-    first, second = item
-    return _number(first), _number(second)
-
-
-def _floors(item: Mapping[str, Any]) -> Floors:
-    repeated = item["repeatability"]
-    noise, numerical = _numbers(item["noise"]), _numbers(item["numerical"])
-    return Floors(noise, numerical, None if repeated is None else _numbers(repeated))
-
-
-def _named(item: Mapping[str, Any]) -> NamedEffect:
-    interval = {
-        param: {joint: (_number(low), _number(high)) for joint, (low, high) in places.items()}
-        for param, places in item["interval"].items()
-    }
-    tuples = {name: tuple(item[name]) for name in ("joints", "alias_set")}
-    share = _number(item.get("share"))  # older results say none
-    return NamedEffect(**{**item, **tuples, "params": _numbers(item["params"]), "interval": interval, "share": share})
-
-
-def _candidate(item: Mapping[str, Any]) -> Candidate:
-    numbers = {name: _number(item[name]) for name in ("excess_after", "log_gain", "p", "size_over_tolerance")}
-    tuples = {name: tuple(item[name]) for name in ("joints", "alias_class")}
-    return Candidate(**{**item, **numbers, **tuples, "params": _numbers(item["params"])})
-
-
-def _localisation(item: Mapping[str, Any] | None) -> Localisation | None:
-    if item is None:
-        return None
-    excess, p = (np.array(item[name], dtype=float) for name in ("excess", "p"))
-    samples, flagged = np.array(item["samples"], dtype=int), np.array(item["flagged"], dtype=bool)
-    return Localisation(tuple(item["joints"]), tuple(item["regimes"]), samples, excess, p, flagged)
-
-
-def _overlay(item: Mapping[str, Any]) -> Overlay:
-    curves = {name: {k: np.array(v, dtype=float) for k, v in item[name].items()} for name in _CURVES}
-    return Overlay(item["episode"], np.array(item["t"], dtype=float), **curves, noise=_numbers(item["noise"]))
-
-
-_CURVES = ("measured", "before", "after")
+def _read(kind: Any, value: Any, path: str) -> Any:
+    """Return plain values as what a type hint of ``gap/result.py`` says; ``path`` names them in messages."""
+    origin, args = get_origin(kind), get_args(kind)
+    if kind is float:
+        return math.nan if value is None else float(value)
+    if kind is np.ndarray:
+        array = np.array(value)
+        return array.astype(float) if array.dtype == object else array  # None among numbers is NaN
+    if kind is ContactConfig:
+        if (contact := read_contact(value)) is None:
+            raise ValueError(f"{path} {value!r}")
+        return contact
+    if is_dataclass(kind) and isinstance(kind, type):
+        hints, given = get_type_hints(kind), [f.name for f in fields(kind)]
+        known = [name for name in given if name in value or name not in NOT_IN_OLDER]
+        return kind(**{name: _read(hints[name], value[name], f"{path}.{name}".lstrip(".")) for name in known})
+    if origin is Literal and value not in args:
+        raise ValueError(f"{path} {value!r}")
+    if origin in (Union, UnionType):
+        arms = [arm for arm in args if arm is not type(None)]
+        if value is None and len(arms) < len(args):
+            return None
+        alike = [arm for arm in arms if (get_origin(arm) is list) == isinstance(value, list)]
+        return _read((alike if len(arms) > 1 else arms)[0], value, path)
+    if origin is dict:
+        return {key: _read(args[1], item, f"{path}.{key}") for key, item in value.items()}
+    if origin is list or (origin is tuple and args[-1] is Ellipsis):
+        return origin(_read(args[0], item, path) for item in value)
+    if origin is tuple:
+        return tuple(_read(arm, item, path) for arm, item in zip(args, value, strict=True))
+    return value

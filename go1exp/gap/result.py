@@ -80,13 +80,13 @@ class GapSettings:
         physics_dt: longest physics step, s; the one used divides the logger's period.
         clock_s: standard deviation of the time by which readings may be stamped early or late against commands, window
             by window; a hundredth of a control step, which nothing in training would notice.
-        phase: what of robots on their feet is compared: ``whole``, the whole robot; ``swing``, legs while they are in
-            the air, which show what joints lack; ``auto``, legs in the air first, and the whole robot if those agree
+        phase: what of standing robots is compared: ``whole``, the whole robot; ``swing``, legs while they are in
+            the air, which show effects at joints; ``auto``, legs in the air first, and the whole robot if those agree
             with the model or hardly swing.
         torque: also score the torque that the drives report, where it was logged.
         calibrate: whether nominal parameters may move within their tolerances first; without, small errors of the model
             are taken for effects (for comparison).
-        judge: by what candidates are judged: ``max_t`` on held-out windows; for comparison ``gain``, any gain there, or
+        judge: how candidates are tested: ``max_t`` on held-out windows; for comparison ``gain``, any gain there, or
             ``bic``, Schwarz's criterion on the windows of the fit.
         alpha: significance that a term needs; ten times that if it removes three quarters of a gap.
         min_share: share of the remaining excess that a term must remove.
@@ -188,7 +188,7 @@ class Candidate:
         alias_class: effects that do as well on these data, itself included.
         status: what became of it.
         reason: why, in a sentence.
-        stage: at which term of the stepwise search it was judged, from 1.
+        stage: at which term of the stepwise search it was tested, from 1.
     """
 
     effect: str
@@ -280,7 +280,7 @@ class AngleErrors:
 class ClockChoice:
     """Which of two clocks the recordings are read by, and what that rests on.
 
-    Both are judged on readings of the same rows, by the same floor, on windows that no fit has seen and that are not
+    Both are tested on readings of the same rows, by the same floor, on windows that no fit has seen and that are not
     of the last check. By clock: of the written times (``recorded``), and of the speeds (``speeds``).
 
     Attributes:
@@ -289,7 +289,7 @@ class ClockChoice:
         reason: why it is not decided; empty if it is.
         rate_hz: clock -> least and largest rate of rows of the recordings, Hz.
         steps: 5 % and 95 % quantile of the steps of the written times over their median; (1, 1) is an even clock.
-        windows: how many judged.
+        windows: number of windows.
         stretches: of neighbouring windows, which count as one in the test.
         nominal_errors: clock -> error of the angles in the median window, rad, of the model within its tolerances.
         errors: clock -> the same with the first terms that a search finds by that clock.
@@ -343,7 +343,7 @@ class GapResult:
         overlays: windows to look at.
         box: parameters within their tolerances: effect -> parameter -> joint or ``robot`` -> value.
         tolerances: that counted: effect -> parameter -> tolerance; where there is none, the effect's declared one.
-        contact: of the feet in the model; None of a robot that is not on its feet, and in older results.
+        contact: of the feet in the model; None of a suspended robot, and in older results.
         clock: which of two clocks was taken; None if the model did not ask for a comparison.
         provenance: hashes, versions, seeds, steps.
         warnings: what a reader must know, a sentence each.

@@ -1,4 +1,4 @@
-"""An answer in words: what the model lacks, where, how sure that is, and what to record next."""
+"""An answer in words: missing effects, where, how sure that is, and what to record next."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from go1exp.gap.score.likelihood import removed
 from go1exp.gap.search import thresholds, tolerances
 from go1exp.gap.search.candidates import deviation
 from go1exp.gap.search.screen import free_shapes
-from go1exp.gap.search.search import Search
+from go1exp.gap.search.state import Search
 from go1exp.sim.effects.tolerances import Tolerances, declared, effect_class, sizes
 
 
-def told_apart(names: Sequence[str]) -> tuple[str, ...]:
+def separating(names: Sequence[str]) -> tuple[str, ...]:
     """Return what to record to tell apart effects that are confounded, each thing once; empty if none of them says."""
     how = {name: tolerances.identification(name) for name in names}
     return tuple(
@@ -35,7 +35,7 @@ def advice(aliases: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
     sentences = []
     for names in aliases.values():
         if len(names) > 1:
-            what = ", and ".join(told_apart(names)) or "record chirp and steps"
+            what = ", and ".join(separating(names)) or "record chirp and steps"
             sentences.append(f"These logs cannot tell {' from '.join(names)}; {what} to separate them.")
     return tuple(sentences)
 
@@ -52,20 +52,20 @@ def where(joints: Sequence[str], everyone: Sequence[str]) -> str:
     return ", ".join(joints)
 
 
-def sentence(answer: Answer, search: Search, silent: Mapping[str, str], suggestions: Sequence[str]) -> str:
+def sentence(answer: Answer, search: Search, unexcited: Mapping[str, str], suggestions: Sequence[str]) -> str:
     """Put the answer into words.
 
     Args:
         answer: what the search comes to.
         search: that is done.
-        silent: effects that the data cannot show.
+        unexcited: effects that the data cannot show.
         suggestions: what to record next, a sentence each.
     """
     everyone = search.state.scorer.windows.joints
     first, final = 1.0 + answer.excess["box"], 1.0 + answer.excess["final"]
     parts = [
         _opening(answer.verdict, first, search),
-        *(_lacking(effect, everyone, search.state.tolerances) for effect in answer.named),
+        *(_effect_sentence(effect, everyone, search.state.tolerances) for effect in answer.named),
     ]
     if answer.named:
         parts.append(
@@ -82,7 +82,7 @@ def sentence(answer: Answer, search: Search, silent: Mapping[str, str], suggesti
     if answer.named and rejected:
         parts.append(f"{' and '.join(rejected)} {'was' if len(rejected) == 1 else 'were'} considered and rejected.")
     quiet = [
-        effect for effect in silent if effect in search.signal or not tolerances.identification(effect).needs_ground
+        effect for effect in unexcited if effect in search.signal or not tolerances.identification(effect).needs_ground
     ]
     if quiet:
         parts.append(f"These logs cannot show {', '.join(quiet)}.")
@@ -116,8 +116,8 @@ def _nearest(search: Search) -> str:
     return f"of which {title} takes {share:.0%} away and yet is not named: {near.reason}."
 
 
-def _lacking(effect: NamedEffect, everyone: Sequence[str], known: Tolerances) -> str:
-    """Return the sentence about one effect that the model lacks: what leaves its tolerance, and its shapes."""
+def _effect_sentence(effect: NamedEffect, everyone: Sequence[str], known: Tolerances) -> str:
+    """Return the sentence about one missing effect: what leaves its tolerance, and its shapes."""
     names = [name for _, name in sizes(effect.effect) if effect.params.get(name)]
     values_of = {name: np.array(list(effect.params[name].values())) for name in names}
     size = {name: deviation({(effect.effect, name): v}, (effect.effect, name), known) for name, v in values_of.items()}

@@ -88,7 +88,7 @@ def windows(
     in which ``torque_enable`` is false, or if their target is not finite.
 
     Raises:
-        RecordingError: if a recording lacks a channel; names it.
+        RecordingError: if a recording has no such channel; names it.
         FitError: if the target needs a ``joint_torque`` and there is none.
     """
     if target == "joint_torque" and joint_torque is None:

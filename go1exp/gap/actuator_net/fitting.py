@@ -13,9 +13,7 @@ import numpy as np
 
 from go1exp import __version__
 from go1exp.gap.actuator_net.dataset import JointTorque, Rows, Split, fingerprint, split, windows
-from go1exp.gap.actuator_net.references import Reference, command, linear, pd
-from go1exp.gap.actuator_net.regimes import thresholds
-from go1exp.gap.actuator_net.report import Report, report, rmse
+from go1exp.gap.actuator_net.report import Reference, Report, command, linear, pd, report, rmse, thresholds
 from go1exp.gap.actuator_net.settings import FitError, FitSettings
 from go1exp.gap.actuator_net.train import Trained, train
 from go1exp.logs.recording import Recording
@@ -65,7 +63,7 @@ def fit(
 
     Raises:
         FitError: if recordings do not fit together, or there are too few.
-        RecordingError: if one lacks a channel that the inputs or the target need.
+        RecordingError: if one has no channel that the inputs or the target need.
     """
     robot, joints, period = _common(recordings, settings)
     parts = split(recordings, settings.holdout, settings.validation, settings.seed)

@@ -113,7 +113,7 @@ def bridged(t: np.ndarray, target: np.ndarray, period: float) -> tuple[np.ndarra
     """Return times and targets with a row for every single lost sample, and the times of those that hide a step.
 
     A target that changes with every sample changed at the lost one too; taking it for held there makes it late by a
-    sample, which is a gap of its own. Whether a target that stepped did so at the lost sample or after, nobody knows.
+    sample, which is a gap of its own. Whether a target that stepped did so at the lost sample or after is unknown.
     """
     lost = np.flatnonzero(np.abs(np.diff(t) / period - 2.0) < 0.5)
     lost = lost[(lost >= 1) & (lost + 2 < len(t))]

@@ -158,14 +158,14 @@ def contact_warnings(recordings: Sequence[Recording], contact: ContactConfig) ->
     others = [r.meta.episode for r in standing if r.meta.contact not in (None, contact)]
     if others:
         return [f"The feet have the contact that was chosen, {contact_text(contact)}; {_listed(others)} name another."]
-    silent = [r.meta.episode for r in standing if r.meta.contact is None]
-    if not silent:
+    unnamed = [r.meta.episode for r in standing if r.meta.contact is None]
+    if not unnamed:
         return []
-    if len(silent) == len(standing):
+    if len(unnamed) == len(standing):
         return [f"No recording names a contact of the feet; the model has {contact_text(contact)}. Another: {CHOOSE}."]
     return [
-        f"{counted(len(silent), 'recording')} of {len(standing)} without a contact of the feet ({_listed(silent)}) are "
-        f"taken to have that of the others, {contact_text(contact)}."
+        f"{counted(len(unnamed), 'recording')} of {len(standing)} without a contact of the feet ({_listed(unnamed)}) "
+        f"are taken to have that of the others, {contact_text(contact)}."
     ]
 
 

@@ -147,7 +147,7 @@ AXES = ("imu_gyro_x", "imu_gyro_y", "imu_gyro_z", "imu_acc_x", "imu_acc_y", "imu
 
 @dataclass(frozen=True)
 class StandingWindows(Windows):
-    """Windows of a robot on its feet.
+    """Windows of a standing robot.
 
     Attributes:
         base: (W, 13) initial state: position m, attitude w-x-y-z, velocity in the world m/s, rate in the trunk rad/s.
@@ -228,7 +228,7 @@ def base_moved(base: Tensor, off: Tensor) -> Tensor:
 
 
 def cut_standing(recordings: Sequence[Recording], settings: GapSettings, config: RobotConfig) -> StandingWindows:
-    """Cut recordings of a Go1 into windows; on its feet they begin where at least two of them carry weight.
+    """Cut recordings of a Go1 into windows; those of a standing one begin where at least two feet carry weight.
 
     Recordings of a held trunk may be among them. Their IMU is not compared: it says nothing that is not known.
     """
@@ -283,7 +283,7 @@ def rows_at(t: np.ndarray, when: np.ndarray) -> np.ndarray:
 
 
 def missing(recording: Recording) -> list[str]:
-    """Return the quantities of the IMU that a recording of a robot on its feet has not."""
+    """Return the quantities of the IMU that a recording of a standing robot has not."""
     wanted = ("imu_gyro", "imu_acc", "imu_quat") if recording.meta.base == "floating" else ()
     return [name for name in wanted if not all(column in recording.channels for column in VECTORS[name])]
 

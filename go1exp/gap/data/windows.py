@@ -165,7 +165,7 @@ class Splits:
 
     Attributes:
         train: to fit.
-        select: to judge by.
+        select: for held-out tests.
         confirm: whole episodes, or stretches of them, that nothing is decided on; may be empty.
         alone: episodes of which some stretches are in ``train`` and some in ``select``.
         shared: those of them that also lend stretches to ``confirm``.
@@ -178,7 +178,7 @@ class Splits:
     shared: tuple[str, ...] = ()
 
     @property
-    def judged(self) -> np.ndarray:
+    def evaluated(self) -> np.ndarray:
         """Windows that no fitted value has seen: those of the last check, or if there are none the held-out ones."""
         return self.confirm if len(self.confirm) else self.select
 
@@ -192,7 +192,7 @@ def stretches(episode: np.ndarray) -> np.ndarray:
 def _kept_whole(kinds: Sequence[tuple[object, ...]], wanted: int, rng: np.random.Generator) -> list[int]:
     """Return which units to keep whole for the last check: of no motion the only one that is left.
 
-    What a motion alone shows (drives that are off, say) cannot be judged by a model that was fitted without it, and
+    What a motion alone shows (drives that are off, say) cannot be tested by a model that was fitted without it, and
     would count against every term.
     """
     motions = [kind[0] for kind in kinds]
@@ -208,8 +208,8 @@ def _kept_whole(kinds: Sequence[tuple[object, ...]], wanted: int, rng: np.random
 def splits(metas: Sequence[Meta], episode: np.ndarray, confirm: float, rng: np.random.Generator) -> Splits:
     """Split windows by episode, or within an episode of which there is only one of its kind.
 
-    What only one episode shows, at the gains that show it, cannot be fitted if that episode judges, nor judged if it
-    is fitted. So of episodes of one motion and gain set half are fitted and half judge; one that is alone is cut into
+    What only one episode shows cannot be fitted if that episode is for tests, nor tested if it is fitted.
+    So of episodes of one motion and gain set half are fitted and half tested; one that is alone is cut into
     stretches of three windows, which take turns. For the last check whole episodes are kept of motions of which there
     are more; if those are fewer than ``confirm`` asks for, every fifth stretch of episodes that are alone is. An
     episode and its repetition count as one.
@@ -220,7 +220,7 @@ def splits(metas: Sequence[Meta], episode: np.ndarray, confirm: float, rng: np.r
         confirm: share for the last check; of fewer than four episodes none whole, and none of short ones.
         rng: of what goes where.
     """
-    shown, episode = np.unique(episode, return_inverse=True)  # one without any window can neither judge nor be fitted
+    shown, episode = np.unique(episode, return_inverse=True)  # one without any window can be neither tested nor fitted
     metas = [metas[k] for k in shown]
     units = list(dict.fromkeys(m.repeat_of or m.episode for m in metas))
     unit = np.array([units.index(m.repeat_of or m.episode) for m in metas])[episode]

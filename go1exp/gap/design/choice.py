@@ -10,9 +10,8 @@ import numpy as np
 from scipy.stats import norm
 
 from go1exp.gap.data.windows import Splits
-from go1exp.gap.design.plan import Attitude, Design, DesignError, library, neighbours
+from go1exp.gap.design.plan import Attitude, Design, DesignError, DesignSettings, library, neighbours
 from go1exp.gap.design.rehearsal import Rehearsal, Stage
-from go1exp.gap.design.settings import DesignSettings
 from go1exp.gap.replay.rows import Theta, variants
 from go1exp.gap.result import GapSettings
 from go1exp.gap.score.likelihood import Scorer, log_chi2
@@ -121,7 +120,7 @@ def power(distance: float, gain: float, same: float, values: float, spread: floa
     return float(total)
 
 
-class Judge:
+class Evaluator:
     """A pair, the rival fitted to what the truth does on the recordings at hand."""
 
     def __init__(self, pair: Pair, scorer: Scorer, settings: GapSettings, dt: float) -> None:
@@ -133,7 +132,7 @@ class Judge:
         measured = _measured(scorer, pair.theta, few, dt)
         start = {key: value.copy() for key, value in pair.without.items()}
         state = State(measured, Splits(few, nothing, nothing), settings, dt, start, pair.terms)
-        self.state = state.settled(2)
+        self.state = state.converged(2)
         assert self.state.fitted is not None
         self.layout = Layout.from_probes(self.state.machine, self.state.fitted.probes)
         self.at_hand = self._evidence(measured, self.state.fitted, len(everything) / len(few), dt)
@@ -183,7 +182,7 @@ def _measured(scorer: Scorer, theta: Theta, windows: np.ndarray, dt: float) -> S
 
 
 ENOUGH = 0.8
-"""Power from which two explanations count as told apart."""
+"""Power from which two explanations count as distinguishable."""
 
 LOT = 20
 """Designs whose windows are replayed together; more would need more memory."""
@@ -203,7 +202,7 @@ class Choice:
     """What a search for a design came to.
 
     Attributes:
-        best: the design; None if no pair can be told apart.
+        best: the design; None if no pair is distinguishable.
         worths: of the recordings at hand and the best design together, pair by pair.
         reach: largest power that any design reached, pair by pair.
         tried: designs that were looked at.
@@ -220,11 +219,11 @@ class Choice:
 class _Search:
     """Designs tried so far."""
 
-    def __init__(self, stage: Stage, judges: Sequence[Judge]) -> None:
-        self.stage, self.judges = stage, judges
+    def __init__(self, stage: Stage, evaluators: Sequence[Evaluator]) -> None:
+        self.stage, self.evaluators = stage, evaluators
         self.dt = stage.comparison.dt  # of what is held against limits
         self.tried = self.beyond = 0
-        self.reach = [judge.worth(judge.at_hand) for judge in judges]
+        self.reach = [evaluator.worth(evaluator.at_hand) for evaluator in evaluators]
 
     def within_limits(self, designs: Sequence[Design]) -> list[Rehearsal]:
         """Return the designs that stay within the limits, as the model plays them."""
@@ -233,23 +232,23 @@ class _Search:
         self.tried, self.beyond = self.tried + len(designs), self.beyond + len(played) - len(allowed)
         return allowed
 
-    def judged(self, played: Sequence[Rehearsal], few: int) -> list[tuple[Worth, ...]]:
+    def evaluated(self, played: Sequence[Rehearsal], few: int) -> list[tuple[Worth, ...]]:
         """Return the worth of each design with the recordings at hand, pair by pair, from ``few`` of its windows."""
         dt = COARSE * self.dt
-        judgements: list[tuple[Worth, ...]] = []
+        results: list[tuple[Worth, ...]] = []
         for k in range(0, len(played), LOT):
             lot = played[k : k + LOT]
             score = self.stage.scored(lot, dt, few)
-            evidences = [judge.evidence(score, dt) for judge in self.judges]
+            evidences = [evaluator.evidence(score, dt) for evaluator in self.evaluators]
             whole = self.stage.seconds / self.stage.comparison.settings.stride_s
             for number in range(len(lot)):
                 worths = []
-                for judge, evidence in zip(self.judges, evidences, strict=True):
+                for evaluator, evidence in zip(self.evaluators, evidences, strict=True):
                     count = int((evidence.episode == number).sum())
                     evidence_of_one = [evidence.one(number, max(whole / count, 1.0))] if count else []
-                    worths.append(judge.worth(judge.at_hand, *evidence_of_one))
-                judgements.append(tuple(worths))
-        return judgements
+                    worths.append(evaluator.worth(evaluator.at_hand, *evidence_of_one))
+                results.append(tuple(worths))
+        return results
 
     def note(self, worths: Sequence[tuple[Worth, ...]]) -> None:
         """Remember how far any design has come, pair by pair."""
@@ -280,7 +279,7 @@ def attainable(worths: Sequence[tuple[Worth, ...]], fallback: bool) -> list[int]
 
 def choose(
     stage: Stage,
-    judges: Sequence[Judge],
+    evaluators: Sequence[Evaluator],
     attitudes: Sequence[Attitude],
     settings: DesignSettings,
     on_progress: Callable[[str, float], None],
@@ -290,27 +289,27 @@ def choose(
     Raises:
         DesignError: if every design goes beyond a limit.
     """
-    rng, search = np.random.default_rng(settings.seed), _Search(stage, judges)
+    rng, search = np.random.default_rng(settings.seed), _Search(stage, evaluators)
     on_progress("designs within the limits", 0.2)
     played = search.within_limits(library(settings.designs, settings.gains, attitudes, rng))
     if not played:
         raise DesignError(f"limits: all of {search.tried} designs go beyond them; allow more (limits.speed=..., ...)")
     on_progress("a quick look at the designs", 0.3)
-    quick = search.judged(played, FEW)
+    quick = search.evaluated(played, FEW)
     goals = attainable(quick, True)
     order = sorted(range(len(played)), key=lambda k: _value(quick[k], goals), reverse=True)[:FINALISTS]
-    # The best for each pair alone is looked at too: a quick look may be wrong about which can be told apart.
-    alone = [max(range(len(played)), key=lambda k, n=n: _order(quick[k][n])) for n in range(len(judges))]  # type: ignore[misc]
+    # The best for each pair alone is looked at too: a quick look may be wrong about which are distinguishable.
+    alone = [max(range(len(played)), key=lambda k, n=n: _order(quick[k][n])) for n in range(len(evaluators))]  # type: ignore[misc]
     finalists = [played[k] for k in dict.fromkeys([*order, *alone])]
     on_progress("a closer look at the best", 0.6)
-    worths = search.judged(finalists, MORE)
+    worths = search.evaluated(finalists, MORE)
     for turn in range(settings.refine):
         goals = attainable(worths, True)
         top = max(range(len(finalists)), key=lambda k: _value(worths[k], goals))
         on_progress("neighbours of the best", 0.7 + 0.3 * turn / settings.refine)
         near = search.within_limits(neighbours(finalists[top].design, FINALISTS, settings.gains, attitudes, rng))
         if near:
-            finalists, worths = [*finalists, *near], [*worths, *search.judged(near, MORE)]
+            finalists, worths = [*finalists, *near], [*worths, *search.evaluated(near, MORE)]
     search.note(worths)
     goals = attainable(worths, False)
     if not goals:

@@ -29,7 +29,7 @@ PLAYED = ("q", "qd", "tau_est")
 """What is kept of a rehearsal: angles, speeds, and the torque that the drives make."""
 
 FADE_S = 1.0
-"""Time at the beginning of a motion at which nobody looks, s: motions grow from rest."""
+"""Time at the beginning of a motion that is not evaluated, s: motions grow from rest."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from torch import Tensor
 import go1exp.sim.effects  # noqa: F401  (registers every effect)
 from go1exp.config.schema.registry import bind
 from go1exp.gap.data.windows import PAST_S, Windows, averaged, held
-from go1exp.gap.replay.rows import Machine, Rows, bolted, mounted
+from go1exp.gap.replay.rows import Machine, Rows, mounted, on_fixed_base
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.effects.base import Measured
 from go1exp.sim.env.plant import FRICTION, Plant
@@ -51,7 +51,7 @@ class Replayer:
         soft = mounted(rows)
         for softly in np.unique(soft):
             members = np.flatnonzero(soft == softly)
-            part = rows if softly else bolted(rows)
+            part = rows if softly else on_fixed_base(rows)
             pieces = int(np.ceil(len(members) / self.max_rows))
             for piece in np.array_split(members, pieces):
                 size = min(padded(len(piece)), self.max_rows)

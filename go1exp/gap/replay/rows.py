@@ -37,7 +37,7 @@ class Machine(Protocol):
 
     @property
     def on_ground(self) -> bool:
-        """Whether it stands on its feet, so that it feels what acts on its trunk and on the ground."""
+        """Whether it stands, so that it feels what acts on its trunk and on the ground."""
 
     @property
     def effort(self) -> tuple[float, ...]:
@@ -129,7 +129,7 @@ def mounted(rows: Rows) -> np.ndarray:
     return away
 
 
-def bolted(rows: Rows) -> Rows:
+def on_fixed_base(rows: Rows) -> Rows:
     """Return rows without effects on a mount."""
     return replace(rows, values={key: v for key, v in rows.values.items() if not effect_class(key[0]).mounts})
 

@@ -78,7 +78,7 @@ def beside(joints: np.ndarray, series: np.ndarray, at: np.ndarray) -> np.ndarray
 
 @dataclass
 class StandingReplayer(Replayer):
-    """Replays windows of a robot on its feet, and those of the same robot suspended.
+    """Replays windows of a standing robot, and those of the same robot suspended.
 
     Attributes:
         held: the same robot with its trunk held.
@@ -128,7 +128,7 @@ class StandingReplayer(Replayer):
 
 
 class TrunkReplayer(StandingReplayer):
-    """Replays windows of a robot on its feet, and tells torques and the trunk's motion beside what is scored."""
+    """Replays windows of a standing robot, and returns torques and the trunk's motion beside what is scored."""
 
     def _recorder(self, steps: int, rows: int) -> TrunkRecorder:
         return TrunkRecorder(steps, rows, self.windows.imu_site)

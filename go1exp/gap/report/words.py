@@ -14,7 +14,7 @@ import go1exp.logs.excitations  # noqa: F401  (registers every effect and excita
 from go1exp.base.report.table import NOTHING, number, share
 from go1exp.config.schema.registry import members
 from go1exp.gap.result import AngleErrors, Clock, ClockChoice, GapResult, GapSettings, Localisation, NamedEffect
-from go1exp.gap.robots.completion import GO1
+from go1exp.gap.robots.go1 import GO1
 from go1exp.gap.search.clocks import OF_CLOCK, span
 from go1exp.gap.sentence import where
 from go1exp.sim.effects.base import Param

@@ -66,7 +66,7 @@ class ModelConfig:
     Attributes:
         mjcf: MuJoCo file; in a file of your own, relative to that file.
         robots: names that recordings of it may carry.
-        base: body that is bolted down.
+        base: body that is fixed.
         joints: driven hinges, in the order of the MuJoCo file; all others are held at zero.
         groups: joints that feel each other, equally many in each group; all in one if null.
         drive: ``position``: torque = kp (target - q) - kd qd, clipped; ``voltage``: that clipped, then less the back

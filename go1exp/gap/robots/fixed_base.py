@@ -1,7 +1,13 @@
-"""Any chain of hinges on a fixed base, from a description."""
+"""Any chain of hinges on a fixed base, from a description, and its recordings completed by that description.
+
+Such recordings may have no gains or velocities, or velocities that disagree with their own angles. What is then
+compared, and what is assumed, is written to the warnings.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,18 +19,22 @@ from torch import Tensor
 
 import go1exp.sim.actuator  # noqa: F401  (registers every actuator)
 from go1exp.base.tensors.randomness import EnvRandom
+from go1exp.config.schema.physics import ContactConfig
 from go1exp.config.schema.registry import ConfigError, Entry, Term
 from go1exp.gap.data.cutting import Place, cut
-from go1exp.gap.data.prepare import Ready, noise_in_time, spaced
+from go1exp.gap.data.prepare import HINT, TELLING, Ready, clock_of_speeds, noise_in_time, slope, spaced
 from go1exp.gap.data.windows import Windows
 from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.rows import pd, voltage
 from go1exp.gap.result import Clock, GapSettings, Phase
-from go1exp.gap.robots.completion import clock_warnings, completed, flaws_of, gain_warnings, wrong_speeds
-from go1exp.gap.robots.description import ModelConfig
+from go1exp.gap.robots.description import Go1Model, ModelConfig
+from go1exp.gap.robots.go1 import suspended
+from go1exp.gap.robots.protocol import Robot
 from go1exp.logs.audit import AuditReport
-from go1exp.logs.recording import Recording
+from go1exp.logs.audit.related import SPEED_CHECKS
+from go1exp.logs.recording import Recording, joint_channel, joint_channels
 from go1exp.robot.actuators import ActuatorSetup
+from go1exp.robot.config import RobotConfig
 from go1exp.sim.actuator.setup import Gains
 from go1exp.sim.effects.tolerances import DECLARED, Tolerances
 from go1exp.sim.physics.fixed_base import FixedBaseError, build_fixed_base, feel_each_other
@@ -150,7 +160,7 @@ class FixedBase:
         return replace(self, config=replace(self.config, clock=clock, speeds=speeds or self.config.speeds))
 
     def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
-        """Return recordings with what they lack taken from the description, and windows whose number is affordable.
+        """Return recordings with what is missing taken from the description, and windows whose number is affordable.
 
         Raises:
             ValueError: if which clock they are read by is still to be compared.
@@ -179,3 +189,126 @@ class FixedBase:
     def replayer(self, windows: Windows, quats: np.ndarray, max_rows: int, threads: int) -> Replayer:
         """Return what runs this robot through windows."""
         return Replayer(self, windows, quats, max_rows, threads)
+
+
+def flaws_of(recording: Recording, report: AuditReport, config: ModelConfig) -> list[str]:
+    """Return why one recording cannot be compared, a line each."""
+    meta, name = recording.meta, recording.meta.episode
+    flaws = []
+    if meta.robot not in config.robots:
+        flaws.append(f"{name}: is of the robot {meta.robot!r}; the model is of {', '.join(config.robots)}; {HINT}")
+    if sorted(meta.joints) != sorted(config.joints):
+        flaws.append(f"{name}: has joints {', '.join(meta.joints)}; the model has {', '.join(config.joints)}")
+        return flaws
+    if meta.base != "fixed":
+        flaws.append(f"{name}: the base is free; only robots with a fixed base can be compared")
+    command = "tau_cmd" if config.drive == "torque" else "q_target"
+    flaws += [f"{name}: no {quantity}" for quantity in ("q", command) if not recording.has(quantity)]
+    if config.drive != "torque" and gains_of(recording, config) is None:
+        flaws.append(f"{name}: says no gains (kp, kd), and the model has none")
+    needed = {"t", "all", *joint_channels("q", meta.joints), *joint_channels(command, meta.joints)}
+    for flaw in report.flaws:
+        # Windows with a hole are left out anyway, so holes are bad only where hardly any window is left.
+        if flaw.verdict == "bad" and flaw.channel in needed and flaw.check not in (*TELLING, "gaps"):
+            flaws.append(f"{name}: {flaw.channel}: {flaw.message}")
+    return flaws
+
+
+def wrong_speeds(recordings: Sequence[Recording], reports: Sequence[AuditReport], config: ModelConfig) -> str:
+    """Return why speeds are not compared; empty if they are."""
+    if config.clock == "speeds":
+        return "they make the clock"
+    if config.speeds == "ignored":
+        return "the model says so (speeds: ignored)"
+    missing = sum(not r.has("qd") for r in recordings)
+    if missing:
+        return f"{missing} of {len(recordings)} recordings have none"
+    bad = [
+        flaw
+        for report in reports
+        for flaw in report.flaws
+        if flaw.channel.startswith("qd_") and (flaw.verdict == "bad" or flaw.check in SPEED_CHECKS)
+    ]
+    return f"{bad[0].channel} {bad[0].message}, and {len(bad) - 1} more such" if bad else ""
+
+
+def clock_warnings(before: Sequence[Recording], after: Sequence[Recording], config: ModelConfig) -> list[str]:
+    """Return what became of the clocks, a sentence each."""
+    if config.clock != "speeds":
+        return []
+    without = [r.meta.episode for r in before if not r.has("qd")]
+    rates = [len(r.t) / float(r.t[-1] - r.t[0]) for r in after]
+    rate = f"Times were worked out from speeds and angles: rows come at {min(rates):.4g} to {max(rates):.4g} Hz."
+    return [rate, *(f"{name} has no speeds and keeps its clock." for name in without)]
+
+
+def gains_of(recording: Recording, config: ModelConfig) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the gains (J,) in the robot's order; None if one is not known."""
+    meta = recording.meta
+    if config.drive == "torque":
+        return np.zeros(len(config.joints)), np.zeros(len(config.joints))
+    order = [meta.joints.index(name) for name in config.joints]
+    kp, kd = config.per_joint("kp"), config.per_joint("kd")
+    if config.firmware and (match := re.search(config.firmware.note, meta.notes)):
+        kp = np.full(len(config.joints), config.firmware.kp * float(match.group(1)))
+    kp = kp if meta.kp is None else np.array(meta.kp)[order]
+    kd = kd if meta.kd is None else np.array(meta.kd)[order]
+    return None if np.isnan([kp, kd]).any() else (kp, kd)
+
+
+def gain_warnings(recordings: Sequence[Recording], config: ModelConfig) -> list[str]:
+    """Return which gains were taken from the model, a sentence each."""
+    if config.drive == "torque":
+        return ["Commanded torques are played open loop."]
+    guessed = [name for name in ("kp", "kd") if any(getattr(r.meta, name) is None for r in recordings)]
+    if not guessed:
+        return []
+    shown = []
+    for name, place in (("kp", 0), ("kd", 1)):
+        values = np.concatenate([gains[place] for r in recordings if (gains := gains_of(r, config))])
+        if name in guessed:
+            shown.append(f"{name} {' '.join(f'{v:.3g}' for v in np.unique(values.round(6)))}")
+    return [f"Gains that the recordings do not say are the model's guess: {', '.join(shown)}."]
+
+
+def completed(recording: Recording, config: ModelConfig, speeds: bool) -> Recording:
+    """Return a recording with joints in order, gains, a command in the place of the target, and speeds from angles."""
+    gains = gains_of(recording, config)
+    assert gains is not None
+    channels = dict(recording.channels)
+    if config.drive == "torque":
+        for joint in config.joints:
+            channels[joint_channel("q_target", joint)] = channels[joint_channel("tau_cmd", joint)]
+    if config.clock == "speeds" and recording.has("qd"):
+        q, qd = (recording.block(*joint_channels(name, config.joints)) for name in ("q", "qd"))
+        channels["t"] = clock_of_speeds(recording.t, q, qd)
+    if speeds:
+        for joint in config.joints:
+            channels[joint_channel("qd", joint)] = slope(channels["t"], channels[joint_channel("q", joint)])
+    kp, kd = (tuple(float(v) for v in values) for values in gains)
+    limit = tuple(float(v) for v in config.per_joint("torque_limit"))
+    meta = dataclasses.replace(recording.meta, joints=config.joints, kp=kp, kd=kd, tau_limit=limit)
+    return Recording(meta, channels)
+
+
+def robot_of(
+    model: ModelConfig | Go1Model, config: RobotConfig, path: str = "model", contact: ContactConfig | None = None
+) -> Robot:
+    """Return the robot of a description; the Go1 is ``config``, suspended.
+
+    Args:
+        model: the description.
+        config: of the Go1.
+        path: key of the description, for messages.
+        contact: of a Go1's feet, if one was chosen.
+
+    Raises:
+        ConfigError: naming the key, if its MuJoCo file does not suit it, or a contact was chosen for a fixed base.
+    """
+    if isinstance(model, Go1Model):
+        return suspended(config, Tolerances.from_effects(model.tolerances), contact)
+    if contact is not None:
+        raise ConfigError(
+            [f"contact: is of the feet of a Go1; {path} is a robot on a fixed base, and it would do nothing"]
+        )
+    return FixedBase.from_config(model, path)

@@ -13,15 +13,14 @@ from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.config.schema.physics import MUJOCO_CONTACT, ContactConfig
 from go1exp.config.schema.registry import Term
 from go1exp.gap.data.cutting import cut
-from go1exp.gap.data.prepare import Ready, contact_of, contact_warnings
-from go1exp.gap.data.standing import StandingWindows, cut_standing, for_feet
+from go1exp.gap.data.prepare import HINT, TELLING, Ready, contact_of, contact_warnings
+from go1exp.gap.data.standing import StandingWindows, cut_standing, for_feet, missing
 from go1exp.gap.data.swings import SwingWindows, cut_swings, for_swings
 from go1exp.gap.data.windows import Windows
 from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.rows import Machine, pd
 from go1exp.gap.replay.walking import HEAVY, StandingReplayer, SwingReplayer
 from go1exp.gap.result import GapSettings, Phase
-from go1exp.gap.robots.completion import ONE_GROUP, go1_flaws
 from go1exp.gap.robots.protocol import Robot
 from go1exp.logs.audit import AuditReport
 from go1exp.logs.recording import Recording
@@ -33,6 +32,46 @@ from go1exp.sim.physics.mujoco_cpu import MujocoCpu
 from go1exp.sim.physics.scene import build_model, weigh_down
 from go1exp.sim.terrain import TerrainConfig, build_terrain
 
+GO1 = "go1"
+ONE_GROUP = (tuple(range(robot.NUM_JOINTS)),)
+"""Legs feel each other through a trunk that is free: all joints are one group."""
+
+NEEDED = ("t", "q", "qd", "q_target")
+"""Channels, or quantities, without which nothing can be replayed."""
+
+
+def go1_flaws(recording: Recording, report: AuditReport, joints: tuple[str, ...], free: bool) -> list[str]:
+    """Return why a recording cannot be compared with a model of the Go1, a line each.
+
+    Args:
+        recording: to compare.
+        report: of its audit.
+        joints: of the model.
+        free: whether the model's trunk is free; a recording of a held one can then be compared as well.
+    """
+    meta, name = recording.meta, recording.meta.episode
+    flaws = []
+    if meta.robot != GO1:
+        flaws.append(f"{name}: is of the robot {meta.robot!r}; the model is of {GO1!r}; {HINT}")
+    if meta.joints != joints:
+        flaws.append(f"{name}: has joints {', '.join(meta.joints)}; the model has {', '.join(joints)}")
+        return flaws
+    if meta.base != "fixed" and not free:
+        flaws.append(f"{name}: the trunk is free; only robots with a fixed base can be compared")
+    if meta.kp is None or meta.kd is None:
+        flaws.append(f"{name}: says no gains (kp, kd)")
+    flaws += [f"{name}: no {q}" for q in ("q", "qd", "q_target") if not recording.has(q)]
+    if free:
+        flaws += [f"{name}: no {quantity}" for quantity in missing(recording)]
+    # When a robot stands, its weight moves joints against their targets; a flipped sign is for the comparison to show.
+    telling = (*TELLING, "sign") if meta.base == "floating" else TELLING
+    if not flaws:
+        for flaw in report.flaws:
+            needed = flaw.channel in (*NEEDED, "all") or flaw.channel.startswith(("q_", "qd_"))
+            if flaw.verdict == "bad" and needed and flaw.check not in telling:
+                flaws.append(f"{name}: {flaw.channel}: {flaw.message}")
+    return flaws
+
 
 class Go1:
     """Base of the Go1's kinds of comparison.
@@ -40,7 +79,7 @@ class Go1:
     Attributes:
         config: of the robot.
         joints: names.
-        on_ground: whether it stands on its feet.
+        on_ground: whether it stands.
         free_trunk: whether its trunk moves.
     """
 
@@ -194,7 +233,7 @@ class SuspendedGo1(Go1):
         base_probe: none, as the trunk is held.
         on_ground: no.
         tolerances: of nominal parameters.
-        contact: of its feet where a recording shows it on them; None takes the one that recordings name.
+        contact: of its feet where it stands in a recording; None takes the one that recordings name.
         free_trunk: no.
     """
 
@@ -227,10 +266,10 @@ class SuspendedGo1(Go1):
         return backend, actuator_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
 
     def suited(self, recordings: Sequence[Recording], phase: Phase = "whole") -> Robot:
-        """Return the Go1 on its feet, or its legs in the air, if its trunk is free in a recording, else this one.
+        """Return the standing Go1, or its legs in the air, if its trunk is free in a recording, else this one.
 
         Raises:
-            ConfigError: for one on its feet, if recordings name different contacts and none was chosen.
+            ConfigError: for a standing one, if recordings name different contacts and none was chosen.
         """
         if not any(r.meta.base == "floating" for r in recordings):
             return self
@@ -254,5 +293,5 @@ class SuspendedGo1(Go1):
 
 
 def suspended(config: RobotConfig, tolerances: Tolerances = DECLARED, contact: ContactConfig | None = None) -> Robot:
-    """Return a Go1 whose trunk is held; on its feet it has ``contact``, or the one that recordings name."""
+    """Return a Go1 whose trunk is held; where it stands it has ``contact``, or the one that recordings name."""
     return SuspendedGo1(config, tolerances=tolerances, contact=contact)

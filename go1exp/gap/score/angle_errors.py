@@ -100,7 +100,7 @@ REGIMES = (
     *("early in the episode", "late in the episode", "small angle", "large angle"),
 )
 ON_FEET = ("stance", "swing", "impact")
-"""Regimes of a robot on its feet, beside the others."""
+"""Regimes of a standing robot, beside the others."""
 
 IMPACT_S = 0.03
 """Time after a foot begins to carry weight that counts as impact, s."""

@@ -1,4 +1,4 @@
-"""Initial states of a robot on its feet: moved to where they fit best, with noise for what a line does not describe.
+"""Initial states of a standing robot: moved to where they fit best, with noise for what a line does not describe.
 
 An initial state enters the score as a linear, Gaussian unknown (``likelihood.py``). On the ground that holds only near
 the state: a foot touches down or slides earlier or later. So the states are first moved to where each window fits best.
@@ -71,13 +71,13 @@ def _mean_square(score: Scorer, residual: np.ndarray) -> np.ndarray:
     return np.asarray(np.sum(back**2, axis=1) / w.valid.sum(1)[:, None, None])
 
 
-def settled(
+def converged(
     replayer: Replayer, dt: float, clock_s: float, theta: Theta | None = None
 ) -> tuple[Scorer, dict[str, float]]:
     """Move the windows' initial states to where they fit best.
 
     Args:
-        replayer: of a robot on its feet.
+        replayer: of a standing robot.
         dt: physics step, s.
         clock_s: as for ``likelihood.scorer``.
         theta: values of the model that they are to fit; the nominal one if None.
@@ -95,7 +95,7 @@ def settled(
     score, numerical = stepped(score, rows, dt)
     score = _bent(score, rows, dt)
     score = dataclasses.replace(score, expected=replayer.windows)
-    return dataclasses.replace(score, renewed=lambda values: settled(replayer, dt, clock_s, values)[0]), numerical
+    return dataclasses.replace(score, updated=lambda values: converged(replayer, dt, clock_s, values)[0]), numerical
 
 
 def _fitted(score: Scorer, rows: Rows, theta: Theta, dt: float) -> Scorer:
@@ -176,17 +176,17 @@ def measured(replayer: Replayer, dt: float, coarse: float, clock_s: float) -> tu
         clock_s: standard deviation of the time between stamps of commands and of readings, s.
     """
     if replayer.machine.on_ground:  # initial states of a free trunk matter so much that they are fitted first
-        return settled(replayer, dt, clock_s)
+        return converged(replayer, dt, clock_s)
 
     def at(theta: Theta) -> tuple[Scorer, dict[str, float]]:
         if replayer.machine.base_probe:  # legs in the air: most of that error is as one of the initial speeds
             plain = scorer(replayer, theta, replayer.windows.scale, dt, clock_s)
             rows = variants(replayer.machine, theta, np.arange(len(replayer.windows)), [])
             score, numerical = stepped(plain, rows, dt)
-            return replace(score, renewed=lambda values: at(values)[0]), numerical
+            return replace(score, updated=lambda values: at(values)[0]), numerical
         scale, numerical = numerical_scale(replayer, dt, theta)
         score = scorer(replayer, theta, scale, coarse, clock_s)
-        return replace(score, renewed=lambda values: at(values)[0]), numerical
+        return replace(score, updated=lambda values: at(values)[0]), numerical
 
     return at({})
 

@@ -89,7 +89,7 @@ class Scorer:
         scale: (W, C, J) standard deviation of noise and numerical error.
         state: (W, G, m, k) change of the readings, in units of ``scale``, per standard deviation of the initial state
             and of the clock.
-        renewed: returns a scorer whose floors and initial states suit other values of the model.
+        updated: returns a scorer whose floors and initial states suit other values of the model.
         clock_s: what the clock was taken to be off by, s.
         finer: residuals are replayed at this part of the step that columns and floors are measured at.
         expected: the windows with their initial states as sensors tell them, where those were moved; None if not.
@@ -100,7 +100,7 @@ class Scorer:
     replayer: Replayer
     scale: np.ndarray
     state: np.ndarray
-    renewed: Callable[[Theta], Scorer] | None = None
+    updated: Callable[[Theta], Scorer] | None = None
     clock_s: float = 0.0
     expected: Windows | None = None
     finer: int = 1
@@ -136,7 +136,7 @@ class Scorer:
 def state_probes(machine: Machine, theta: Theta | None = None) -> list[Probe]:
     """Return the probes of the initial state: angles, then speeds, of each place in the groups; then of the base.
 
-    A base has a state where it is free, or where ``theta`` puts it on a mount that gives way.
+    A base has a state where it is free, or where ``theta`` puts it on a compliant mount.
     """
     places, joints = range(len(machine.groups[0])), len(machine.joints)
     joints_probes = [

@@ -69,8 +69,8 @@ def parameters(model: Model) -> int:
     return max(len(used), 1)
 
 
-def candidate(model: Model, joints: Sequence[str], **judged: object) -> Candidate:
-    """Write a fitted model down; ``judged`` are the other fields of :class:`~go1exp.gap.result.Candidate`."""
+def candidate(model: Model, joints: Sequence[str], **tested: object) -> Candidate:
+    """Write a fitted model down; ``tested`` are the other fields of :class:`~go1exp.gap.result.Candidate`."""
     tolerances = model.may.tolerances
     where = beyond(model.name, model.theta, joints, tolerances)
     params: dict[str, list[float] | float] = {}
@@ -81,7 +81,7 @@ def candidate(model: Model, joints: Sequence[str], **judged: object) -> Candidat
             params[key[1]] = [float(v) for v in full[where]] if per_joint else float(full[0])
     names = tuple(j for j, b in zip(joints, where, strict=True) if b)
     largest = size(model.name, model.theta, tolerances)
-    return Candidate(effect=model.name, joints=names, params=params, size_over_tolerance=largest, **judged)  # type: ignore[arg-type]
+    return Candidate(effect=model.name, joints=names, params=params, size_over_tolerance=largest, **tested)  # type: ignore[arg-type]
 
 
 def absorbed(
@@ -118,14 +118,14 @@ def absorbed(
     ]
 
 
-def inaudible(signal: Mapping[str, float], threshold: float, judged: Sequence[str]) -> list[Candidate]:
+def unexcited_rows(signal: Mapping[str, float], threshold: float, tested: Sequence[str]) -> list[Candidate]:
     """Return rows for the effects that the data cannot show."""
     return [
         Candidate(
             effect, (), {}, math.nan, 0.0, 1.0, 0.0, (effect,), "not excited", "twice its tolerance would not show"
         )
-        for effect, loud in signal.items()
-        if loud < threshold and effect not in judged
+        for effect, level in signal.items()
+        if level < threshold and effect not in tested
     ]
 
 

@@ -18,8 +18,7 @@ from go1exp.gap.score.linear import Layout, Table, table, unbiased_grams
 from go1exp.gap.search import significance, thresholds, tolerances
 from go1exp.gap.search.candidates import at_bound
 from go1exp.gap.search.fit import descend
-from go1exp.gap.search.search import LastCheck, Search
-from go1exp.gap.search.state import State
+from go1exp.gap.search.state import LastCheck, Search, State
 from go1exp.sim.effects.tolerances import sizes
 
 
@@ -166,7 +165,7 @@ def doubt(search: Search, effect: str, theta: Theta, joints: Sequence[str], adeq
         return "it leaves its tolerance at no joint beyond doubt"
     if bound := on_bound(search, effect, theta, joints):
         return bound
-    if len(joints) == 1 and search.strained and search.first - excess(search.select_chi2) < search.settings.material:
+    if len(joints) == 1 and search.marginal and search.first - excess(search.select_chi2) < search.settings.material:
         return "the tolerances do nearly as well, and at one joint many effects act alike"
     if adequate:
         return ""
@@ -201,5 +200,5 @@ def widened(
         null: of the parameter.
         share: half width, relative.
     """
-    astray = share * np.abs(value - null)
-    return value - np.hypot(value - low, astray), value + np.hypot(high - value, astray)
+    bias = share * np.abs(value - null)
+    return value - np.hypot(value - low, bias), value + np.hypot(high - value, bias)

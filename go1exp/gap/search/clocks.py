@@ -1,19 +1,22 @@
 """Two clocks as competing models of the time between rows: which of them lets the robot's model explain the recordings.
 
-A model that lacks things can do better by a wrong clock: a wrong rate looks like wrong inertias. So for each clock the
-nominal parameters move within their tolerances, and a search finds the first terms. Both are then judged on held-out
+An incomplete model can do better by a wrong clock: a wrong rate looks like wrong inertias. So for each clock the
+nominal parameters move within their tolerances, and a search finds the first terms. Both are then tested on held-out
 windows of the same rows, by one floor.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 
-from go1exp.gap.data.windows import Splits, stretches
+from go1exp.gap.data.cutting import FIT_S, Place, even_clock
+from go1exp.gap.data.standing import rows_at
+from go1exp.gap.data.windows import PAST_S, Splits, Windows, stretches
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import DEFAULT_CLOCK, Clock, ClockChoice, GapSettings
 from go1exp.gap.score.angle_errors import of_angles
@@ -21,8 +24,137 @@ from go1exp.gap.score.initial_state import rescaled
 from go1exp.gap.score.likelihood import Scorer, log_chi2
 from go1exp.gap.search import significance, thresholds
 from go1exp.gap.search.fit import residuals
-from go1exp.gap.search.search import Search, begun
+from go1exp.gap.search.state import Search, begun
 from go1exp.gap.search.stepwise import run
+from go1exp.logs.recording import Recording, RecordingError
+
+TRIES = 9
+"""Rows at which a window may begin: the one with the smoothest motion about it is taken."""
+
+SMOOTH_ROWS = 3
+"""Rows to both sides in which motion is looked at for that."""
+
+Key = TypeVar("Key", bound=str)
+Cut = Callable[[Sequence[Sequence[Place]]], Windows]
+"""Cuts recordings by one clock at places of each."""
+
+
+def rows_of(windows: Windows, which: np.ndarray, recordings: Sequence[Recording]) -> list[np.ndarray]:
+    """Return which rows of each recording (T,) bool have a part in some windows (numbers), first state included."""
+    masks = []
+    for e, recording in enumerate(recordings):
+        t, mask = even_clock(recording), np.zeros(len(recording.t), dtype=bool)
+        for k in which[windows.episode[which] == e]:
+            mask |= (t >= windows.begin[k] - FIT_S) & (t <= windows.begin[k] + windows.length)
+        masks.append(mask)
+    return masks
+
+
+def beginnings(clocks: Sequence[np.ndarray], q: np.ndarray, settings: GapSettings, spared: np.ndarray) -> list[int]:
+    """Return rows of one recording at which windows may begin by every clock.
+
+    About one stride apart, where the motion is smooth within a third of it, as for windows of one clock. Smoothness is
+    computed from the rows alone, so that no clock has its way.
+
+    Args:
+        clocks: times (T,), s, by each.
+        q: angles (T, J), rad.
+        settings: lengths of windows.
+        spared: (T,) bool, rows that no window may have.
+    """
+    length = settings.burn_s + settings.window_s
+    bend = np.abs(np.diff(q, 3, axis=0, prepend=q[:1], append=q[-2:]))
+    bend = (bend / np.maximum(np.median(bend, axis=0), 1e-9)).max(axis=1)
+    rough = np.convolve(bend, np.ones(2 * SMOOTH_ROWS + 1), "same")
+    stride = max(round(settings.stride_s / float(np.median(np.diff(t)))) for t in clocks)
+    taken = np.concatenate([[0], np.cumsum(spared)])
+
+    def free(row: int) -> bool:
+        ends = [int(np.searchsorted(t, t[row] + length)) for t in clocks]
+        first = min(int(np.searchsorted(t, t[row] - FIT_S)) for t in clocks)
+        return max(ends) < len(q) and taken[max(ends)] == taken[first]
+
+    begun: list[int] = []
+    row = max(int(np.searchsorted(t, t[0] + PAST_S)) for t in clocks)
+    while row < len(q):
+        tries = [r for r in np.unique(np.linspace(row, row + stride / 3, TRIES).astype(int)) if r < len(q) and free(r)]
+        if tries:
+            begun.append(int(min(tries, key=lambda r: rough[r])))
+        row += stride
+    return begun
+
+
+def same_rows(
+    recordings: Mapping[Key, Sequence[Recording]],
+    cuts: Mapping[Key, Cut],
+    settings: GapSettings,
+    spared: Sequence[np.ndarray],
+) -> tuple[dict[Key, Windows], dict[Key, int]]:
+    """Return windows by each clock that begin at the same rows, compare the same rows, and have the same floor.
+
+    Beside them, how many of the places that were tried each clock leaves: no window may have a hole by its clock.
+
+    Noise is the smaller of what is seen by the clocks, since a wrong one makes motion look like noise. The first states
+    are as uncertain as by the clock that knows them less.
+
+    Args:
+        recordings: by each clock.
+        cuts: how to cut them by that clock.
+        settings: lengths of windows.
+        spared: rows (T,) bool of each recording that no window may have.
+
+    Raises:
+        RecordingError: if not one window fits by all clocks.
+    """
+    clocks = {name: [even_clock(r) for r in logs] for name, logs in recordings.items()}
+    first = next(iter(recordings.values()))
+    order = list(range(len(first)))
+    rows = [beginnings([c[e] for c in clocks.values()], first[e].joint("q"), settings, spared[e]) for e in order]
+    windows = _cut_at(rows, clocks, cuts)
+    begun = {name: _begun(w, clocks[name]) for name, w in windows.items()}
+    left = {name: len(each) for name, each in begun.items()}
+    common = set.intersection(*(set(each) for each in begun.values()))
+    if not common:
+        raise RecordingError("no window is whole by both clocks")
+    windows = _cut_at([[r for r in rows[e] if (e, r) in common] for e in order], clocks, cuts)
+    return _shared({n: _masked(w, clocks[n], list(clocks.values()), settings) for n, w in windows.items()}), left
+
+
+def _cut_at(
+    rows: Sequence[Sequence[int]], clocks: Mapping[Key, Sequence[np.ndarray]], cuts: Mapping[Key, Cut]
+) -> dict[Key, Windows]:
+    """Cut windows that begin at rows of each recording, by each clock."""
+    return {
+        name: cuts[name]([[Place(t[r], t[r]) for r in rows[e]] for e, t in enumerate(clock)])
+        for name, clock in clocks.items()
+    }
+
+
+def _begun(windows: Windows, clock: Sequence[np.ndarray]) -> list[tuple[int, int]]:
+    """Return recording and row at which each window begins."""
+    pairs = zip(windows.episode.tolist(), windows.begin, strict=True)
+    return [(e, int(rows_at(clock[e], np.array([begin]))[0])) for e, begin in pairs]
+
+
+def _masked(
+    windows: Windows, clock: Sequence[np.ndarray], everyone: Sequence[Sequence[np.ndarray]], settings: GapSettings
+) -> Windows:
+    """Return windows by one clock of which only rows are valid that are scored by all clocks."""
+    valid = windows.valid.copy()
+    for k, (e, start) in enumerate(_begun(windows, clock)):
+        rows = rows_at(clock[e], windows.begin[k] + windows.t[k])
+        for other in everyone:
+            since = other[e][rows] - other[e][start]
+            valid[k] &= (since >= settings.burn_s - 1e-7) & (since <= settings.burn_s + settings.window_s + 1e-7)
+    return replace(windows, valid=valid)
+
+
+def _shared(windows: Mapping[Key, Windows]) -> dict[Key, Windows]:
+    """Return windows with the least noise, and the widest first states, of all."""
+    every = list(windows.values())
+    scale = np.min([w.scale for w in every], axis=0)
+    q_sd, qd_sd = (np.max([getattr(w, name) for w in every], axis=0) for name in ("q_sd", "qd_sd"))
+    return {name: replace(w, scale=scale, q_sd=q_sd, qd_sd=qd_sd) for name, w in windows.items()}
 
 
 @dataclass(frozen=True)
@@ -44,7 +176,7 @@ def contest(
     settings: GapSettings,
     on_progress: Callable[[str, float], None] = lambda what, share: None,
 ) -> ClockChoice:
-    """Fit the model by both clocks on one half of the windows, judge both on the other, and the other way round.
+    """Fit the model by both clocks on one half of the windows, test both on the other, and the other way round.
 
     A clock is taken if the sign-flip test over stretches of neighbouring windows is significant (``settings.alpha``),
     the mean of log chi2 differs by more than what means the same (``SAME_GAIN``), and the model without terms
@@ -58,7 +190,7 @@ def contest(
     """
     asked = dataclasses.replace(settings, max_terms=min(thresholds.CLOCK_TERMS, settings.max_terms), bootstraps=0)
     halves = (parts, dataclasses.replace(parts, train=parts.select, select=parts.train))
-    nominal, last = _Judged(), _Judged()
+    nominal, last = _HeldOut(), _HeldOut()
     terms: dict[Clock, dict[str, None]] = {name: {} for name in sides}
     for k, half in enumerate(halves):
         searches: dict[Clock, Search] = {}
@@ -76,8 +208,8 @@ def contest(
     which = np.concatenate([half.select for half in halves])
     stretch = stretches(sides["recorded"].scorer.windows.episode)[which]
     rng = np.random.default_rng(settings.seed)
-    nominal_gain, _, nominal_p = judged(nominal.log_chi2, stretch, rng)
-    gain, interval, p = judged(last.log_chi2, stretch, rng)
+    nominal_gain, _, nominal_p = compared(nominal.log_chi2, stretch, rng)
+    gain, interval, p = compared(last.log_chi2, stretch, rng)
     choice = ClockChoice(
         taken=DEFAULT_CLOCK,
         decided=False,
@@ -110,7 +242,7 @@ def decided(choice: ClockChoice, alpha: float) -> ClockChoice:
     return dataclasses.replace(choice, taken=taken, decided=True, reason="")
 
 
-def judged(
+def compared(
     log_chi2_of: Mapping[Clock, np.ndarray], stretch: np.ndarray, rng: np.random.Generator
 ) -> tuple[float, tuple[float, float], float]:
     """Return by how much log chi2 (V,) is larger by the written times: mean, 95 % interval, two-sided p.
@@ -129,7 +261,7 @@ def judged(
 
 
 @dataclass(frozen=True)
-class _Judged:
+class _HeldOut:
     """What was found of windows that were held out: by clock, log chi2 (V,) and errors of the angles (V,), rad."""
 
     log_chi2: dict[Clock, np.ndarray] = field(default_factory=dict)
@@ -142,7 +274,7 @@ class _Judged:
 
     def also(
         self, models: Mapping[Clock, tuple[Scorer, Theta]], sides: Mapping[Clock, Contestant], which: np.ndarray
-    ) -> _Judged:
+    ) -> _HeldOut:
         """Return the same with more windows (numbers), scored by models with one floor.
 
         Each scorer has the error of the step of its own model in its noise. The larger of the two counts.
@@ -157,7 +289,7 @@ class _Judged:
             off = np.sqrt(np.nanmean(of_angles(same, residual, which) ** 2, axis=1))
             logs[name] = np.concatenate([logs.get(name, np.empty(0)), chi2])
             errors[name] = np.concatenate([errors.get(name, np.empty(0)), off])
-        return _Judged(logs, errors)
+        return _HeldOut(logs, errors)
 
 
 # ---------------------------------------------------------------------- in words

@@ -27,7 +27,7 @@ def begun(score: Scorer, dt: float) -> Scorer:
     """Return a scorer with the same floors whose initial states are those that sensors tell.
 
     Args:
-        score: of a robot on its feet (``first_state.settled``), of the nominal model.
+        score: of a standing robot (``initial_state.converged``), of the nominal model.
         dt: physics step, s.
     """
     assert score.expected is not None

@@ -15,8 +15,7 @@ from go1exp.gap.score.likelihood import excess, log_chi2, removed
 from go1exp.gap.score.linear import Layout, predicted
 from go1exp.gap.search import candidates, significance, thresholds, tolerances
 from go1exp.gap.search.certainty import bootstrapped
-from go1exp.gap.search.search import Search
-from go1exp.gap.search.state import State
+from go1exp.gap.search.state import Search, State
 from go1exp.sim.effects.tolerances import sizes
 
 
@@ -43,7 +42,7 @@ def pieces(joints: Sequence[str]) -> list[frozenset[int]]:
 
 
 class Linear:
-    """The linear model of a settled state, on the windows of the fit and on those that no fit has seen."""
+    """The linear model of a converged state, on the windows of the fit and on those that no fit has seen."""
 
     def __init__(self, state: State) -> None:
         """Take it as it is known on the windows of the fit; on held-out ones it is measured where it is asked for."""
@@ -81,8 +80,8 @@ class Linear:
 def chosen(linear: Linear, name: str, kept: frozenset[tuple[str, int]], rng: np.random.Generator) -> frozenset[int]:
     """Return the joints at which a term leaves its tolerance for a reason.
 
-    Sets of joints are added as long as each joint pays for itself; then joints are taken away that bring too little, or
-    that held-out windows do not miss.
+    Sets of joints are added as long as each joint gains more than ``JOINT_GAIN``. Then joints are taken away that bring
+    too little, or that held-out windows do not miss.
 
     Args:
         linear: of the model with the term.
@@ -181,7 +180,7 @@ def reduced(search: Search) -> Search:
 def eliminate(search: Search) -> Search:
     """Return the search without the terms without which the rest does as well."""
     for name in [t for t in search.state.terms if t != search.single and len(search.state.terms) > 1]:
-        rest = search.state.without(name).settled(1)
+        rest = search.state.without(name).converged(1)
         without = rest.held_out()
         gain = significance.gains(without, search.select_chi2[None])
         share = removed(excess(without), excess(search.select_chi2))
@@ -200,9 +199,9 @@ def simplify(search: Search) -> Search:
         simpler = tolerances.identification(name).simpler
         if not simpler or simpler in search.state.terms:
             continue
-        if search.strained and simpler in search.aliases[name]:
+        if search.marginal and simpler in search.aliases[name]:
             continue  # of so small a gap neither explains clearly more: both are named, as a set
-        rest = instead_of(search.state, name).settled(2)
+        rest = instead_of(search.state, name).converged(2)
         before, after = search.state.held_out(search.nominal), search.state.held_out()
         gain, less = significance.gains(before, np.stack([after, rest.held_out()])).mean(axis=1)
         large = candidates.size(simpler, rest.theta, rest.tolerances) > 1.0
@@ -236,7 +235,7 @@ def concentrate(search: Search, name: str) -> Search:
     outside = np.flatnonzero(candidates.beyond(name, search.state.theta, joints, search.state.tolerances))
     for inside in fewer(linear, name, search.state.kept):
         others = frozenset((name, int(j)) for j in outside if j not in inside)
-        sparse = search.state.keeping(search.state.kept | others).settled(3, rival=search.state)
+        sparse = search.state.keeping(search.state.kept | others).converged(3, rival=search.state)
         chi2 = sparse.held_out()
         loss = -significance.gains(search.select_chi2, chi2[None])
         worse = significance.max_t(loss, search.rng, len(search.state.machine.groups))[0]
@@ -252,7 +251,7 @@ def keep_within(search: Search, kept: frozenset[tuple[str, int]]) -> Search | No
         search: the present one.
         kept: effects and joints, those that are kept already among them.
     """
-    sparse = search.state.keeping(kept).settled(2)
+    sparse = search.state.keeping(kept).converged(2)
     chi2 = sparse.held_out()
     if significance.gains(search.select_chi2, chi2[None]).mean() < -thresholds.SAME_GAIN:
         return None  # what looked small in the linear model was not
@@ -273,7 +272,7 @@ def symmetrical(search: Search) -> Search:
         wide = norm.ppf(1.0 - 0.025 / max(int(outside.sum()), 1)) * differences.std(axis=0)
         if not np.all((np.abs(differences.mean(axis=0)) <= wide)[outside]):
             continue
-        rest = instead_of(search.state, name).settled(2)
+        rest = instead_of(search.state, name).converged(2)
         if candidates.size(how.simpler, rest.theta, rest.tolerances) > 1.0:
             search = replaced(search, name, how.simpler, rest, still_equal(search, name, how.simpler, rest))
     return search
@@ -287,7 +286,7 @@ def still_equal(search: Search, name: str, instead: str, rest: State) -> tuple[s
     others = [n for n in search.aliases.get(name, ()) if n != instead and n not in search.state.terms]
     if not others:
         return ()
-    fitted = [search.state.without(name, other).settled(2) for other in others]
+    fitted = [search.state.without(name, other).converged(2) for other in others]
     held_out = np.stack([rest.held_out(), *(state.held_out() for state in fitted)])
     equal = significance.equals(significance.gains(search.state.held_out(search.nominal), held_out), 0, search.rng)
     large = [candidates.size(n, s.theta, s.tolerances) > 1.0 for n, s in zip(others, fitted, strict=True)]
@@ -333,8 +332,8 @@ def unite(search: Search) -> Search:
     for model in search.rivals:
         if model.name in several:
             continue
-        theta = {key: v for key, v in model.theta.items() if key[0] in (model.name, *search.state.loosened)}
-        rest = replace(search.state, terms=(model.name,), kept=frozenset(), theta=theta).settled(4)
+        theta = {key: v for key, v in model.theta.items() if key[0] in (model.name, *search.state.relaxed)}
+        rest = replace(search.state, terms=(model.name,), kept=frozenset(), theta=theta).converged(4)
         chi2 = rest.held_out()
         before = search.state.held_out(search.nominal)
         gain, less = significance.gains(before, np.stack([search.select_chi2, chi2])).mean(axis=1)

@@ -26,8 +26,8 @@ class Variant:
         effect: registered name.
         probes: what was changed to see it; empty for one whose columns the box has.
         shapes: values of its shapes.
-        exact: whether it is judged and begun just as it was probed, since it is far from linear: half of a limit that
-            bites may bite nothing.
+        exact: whether it is evaluated and begun just as it was probed, since it is far from linear: half a torque limit
+            may clip nothing.
     """
 
     effect: str
@@ -218,7 +218,7 @@ def screen(
 
 
 class _Ranking:
-    """The linear model of all variants together, from which each is judged by itself."""
+    """The linear model of all variants together, from which each is evaluated by itself."""
 
     def __init__(self, scorer: Scorer, present: Table, full: Table, may: tolerances.Freedom) -> None:
         """Take the linear model ``own`` of what may move already, and ``full``, which adds the probes of variants."""
@@ -229,7 +229,7 @@ class _Ranking:
         self.plain, self.count = tolerances.cost(scorer, present)(may), tolerances.values(scorer, present)
 
     def screened(self, variant: Variant, at: int) -> Screened:
-        """Judge a variant whose probes begin at column ``at``."""
+        """Evaluate a variant whose probes begin at column ``at``."""
         theta, known = self.full.theta, len(self.present.probes)
         added = list(range(at, at + len(variant.probes)))
         pick = [*range(known), *added]
@@ -270,22 +270,22 @@ def outside(screened: Sequence[Screened], within: Collection[str]) -> list[Scree
     return [s for s in order if s.relief > order[0].relief / thresholds.RIVAL_RATIO]
 
 
-def rivals(screened: Sequence[Screened], straining: Collection[str], within: Collection[str]) -> list[Screened]:
-    """Return how effects could be missing that one which strains against its tolerance is easily taken for.
+def rivals(screened: Sequence[Screened], active: Collection[str], within: Collection[str]) -> list[Screened]:
+    """Return variants of effects that one with an active bound is easily taken for.
 
-    Only those that have no tolerance to move in, since all others strain for themselves, and that would relieve the
-    model nearly as much as the first that strains: of each the way that would do so most.
+    Only effects without a tolerance, since the bounds of all others would be active too, that would relieve the model
+    nearly as much as the first active one; of each the variant that would do so most.
 
     Args:
         screened: what the linear model says of every effect.
-        straining: effects that would leave their tolerance.
+        active: effects that would leave their tolerance.
         within: effects that move within their tolerances already.
     """
-    most = max((s.relief for s in screened if s.variant.effect in straining), default=0.0)
+    most = max((s.relief for s in screened if s.variant.effect in active), default=0.0)
     best: dict[str, Screened] = {}
     for s in sorted(screened, key=lambda s: -s.relief):
         name = s.variant.effect
-        if name not in within and any(tolerances.confounded(name, one) for one in straining):
+        if name not in within and any(tolerances.confounded(name, one) for one in active):
             best.setdefault(name, s)
     return [s for s in best.values() if s.relief > most / thresholds.RIVAL_RATIO]
 
@@ -319,7 +319,7 @@ def _signal(
 
 
 def _columns(scorer: Scorer, theta: Theta, windows: np.ndarray, probes: Sequence[Probe], dt: float) -> np.ndarray:
-    """Return the columns of probes, replayed a few effects at a time: a step pays for every effect on the plant."""
+    """Return the columns of probes, replayed a few effects at a time: each one on the plant costs time."""
     machine, replayer = scorer.replayer.machine, scorer.replayer
     by_effect: dict[str, list[int]] = {}
     for k, p in enumerate(probes):

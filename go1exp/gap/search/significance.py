@@ -1,4 +1,4 @@
-"""Judgement on data that no fit has seen: splits, sign flips, sets of equals, resamplings."""
+"""Tests on data that no fit has seen: splits, sign flips, sets of equals, resamplings."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from go1exp.gap.search import thresholds
 def gains(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Return the fall of log chi2 (M, V G) of models in every window and group of joints.
 
-    Groups do not feel each other, so each is a judgement of its own; an effect that few windows show needs them all.
+    Groups do not feel each other, so each is a sample of its own; an effect that few windows show needs them all.
 
     Args:
         before: chi2 per value (V, G).
@@ -28,7 +28,7 @@ def max_t(
 
     Under the hypothesis that a model gains nothing, a window's gain is as likely negative. All models' signs are
     flipped together, window by window, and each is compared with the largest statistic of all. Beside the mean over
-    all, each group of joints is looked at by itself: what one joint of one leg lacks, the other legs' noise would hide.
+    all, each group of joints is looked at by itself: noise of the other legs would hide an effect at one joint.
 
     Args:
         gain: of every window and group, the groups of a window side by side.

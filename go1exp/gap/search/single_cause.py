@@ -21,8 +21,7 @@ from go1exp.gap.score.linear import table
 from go1exp.gap.search import profile_likelihood, reduction, significance, thresholds, tolerances
 from go1exp.gap.search.certainty import bootstrapped
 from go1exp.gap.search.fit import Model, fit, scores
-from go1exp.gap.search.search import Search
-from go1exp.gap.search.state import State
+from go1exp.gap.search.state import Search, State
 from go1exp.sim.effects.tolerances import effect_class, sizes
 
 
@@ -165,11 +164,11 @@ def _off_alike(begun: Scorer, best: Theta, windows: np.ndarray, dt: float) -> Th
     return profile_likelihood.at_one_part(begun, everywhere, of_drives, reduction.parts(joints), windows, dt)
 
 
-Judge = Callable[[Search, Sequence[Model], State, np.ndarray, np.ndarray], tuple[Search, Model | None, Model | None]]
-"""Tests fitted candidates on held-out windows (``stepwise.judged``)."""
+Test = Callable[[Search, Sequence[Model], State, np.ndarray, np.ndarray], tuple[Search, Model | None, Model | None]]
+"""Tests fitted candidates on held-out windows (``stepwise.held_out_test``)."""
 
 
-def cause(search: Search, judged: Judge) -> tuple[Search, Sought]:
+def cause(search: Search, test: Test) -> tuple[Search, Sought]:
     """Return the effect of the whole robot, or alike at all joints, that explains nearly everything by itself, if any.
 
     Initial states that suit the nominal model hide a part of what is missing. So effects are compared by initial states
@@ -177,7 +176,7 @@ def cause(search: Search, judged: Judge) -> tuple[Search, Sought]:
 
     Args:
         search: that has not begun.
-        judged: tests the best effect.
+        test: tests the best effect.
 
     Returns:
         The search, whose evidence has the best effect if it was tested, and that effect.
@@ -192,21 +191,21 @@ def cause(search: Search, judged: Judge) -> tuple[Search, Sought]:
     sought = clearest(begun, state)
     if sought.best is None:
         return search, sought
-    search, best = _confirmed(sought.best, search, judged, plain, now)
+    search, best = _confirmed(sought.best, search, test, plain, now)
     if best is not None:
         return search, Sought(best, {})
     return search, Sought(None, sought.within or _off_alike(begun, sought.best.theta, train, dt))
 
 
 def _confirmed(
-    best: Model, search: Search, judged: Judge, plain: np.ndarray, now: np.ndarray
+    best: Model, search: Search, test: Test, plain: np.ndarray, now: np.ndarray
 ) -> tuple[Search, Model | None]:
     """Return the clearest cause fitted joint by joint at states that suit it, if it still is the one cause.
 
     Args:
         best: the cause.
         search: that has not begun.
-        judged: tests it.
+        test: tests it.
         plain: (V, G) chi2 of the nominal model on the windows of the fit.
         now: the same on held-out windows.
     """
@@ -214,10 +213,10 @@ def _confirmed(
     if state.settings.effects and best.name not in state.settings.effects:
         return search, None
     for _ in range(thresholds.CAUSE_TURNS):
-        state = replace(state, theta=best.theta).renewed()
+        state = replace(state, theta=best.theta).updated()
         best = refitted(state.scorer, best, state.splits.train, state.dt)
     if not may_be(best, state):
         return search, None
     share = removed(excess(now), excess(state.held_out(best.theta)))
-    search, accepted, _ = judged(search, [best], state, plain, now)
+    search, accepted, _ = test(search, [best], state, plain, now)
     return search, best if accepted is not None and share >= thresholds.NEARLY_ALL else None

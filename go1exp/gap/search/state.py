@@ -1,18 +1,19 @@
-"""The present model of a search: which effects may move, their values, and how well they fit."""
+"""The state of a search: its model, its evidence, and what became of its terms. Each step returns a new one."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from go1exp.gap.data.windows import Splits
 from go1exp.gap.replay.rows import Key, Machine, Theta
-from go1exp.gap.result import GapSettings
-from go1exp.gap.score.likelihood import Scorer, log_chi2
+from go1exp.gap.result import Candidate, GapSettings
+from go1exp.gap.score.likelihood import Scorer, excess, log_chi2, removed
 from go1exp.gap.score.linear import Table, borrowed, table
-from go1exp.gap.search import thresholds, tolerances
+from go1exp.gap.search import significance, thresholds, tolerances
 from go1exp.gap.search.fit import Model, descend, scores
 from go1exp.gap.search.screen import free_shapes
 from go1exp.gap.search.tolerances import Freedom
@@ -30,7 +31,7 @@ class State:
         dt: physics step, s.
         theta: values of the model.
         terms: accepted effects.
-        loosened: effects that may move within their tolerances beside those of the tolerance box.
+        relaxed: effects that may move within their tolerances beside those of the tolerance box.
         kept: effects and joints that stay within tolerance although their effect is a term.
         nominal: the linear model of what may move about the nominal values; None before the first fit.
         fitted: that about ``theta``; None before the first fit.
@@ -43,7 +44,7 @@ class State:
     dt: float
     theta: Theta = field(default_factory=dict)
     terms: tuple[str, ...] = ()
-    loosened: tuple[str, ...] = ()
+    relaxed: tuple[str, ...] = ()
     kept: frozenset[tuple[str, int]] = frozenset()
     nominal: Table | None = None
     fitted: Table | None = None
@@ -62,7 +63,7 @@ class State:
     @property
     def keys(self) -> tuple[Key, ...]:
         """All parameters that may move: those of the tolerance box, and of the terms."""
-        effects = dict.fromkeys([*tolerances.nominal(self.machine), *self.loosened, *self.terms])
+        effects = dict.fromkeys([*tolerances.nominal(self.machine), *self.relaxed, *self.terms])
         shapes = [key for effect in self.terms for key in free_shapes(effect)]
         return (*(key for effect in effects for key in sizes(effect)), *shapes)
 
@@ -92,7 +93,7 @@ class State:
         """Return a model with all terms, to fit."""
         return Model("", theta, self.may, ())
 
-    def settled(self, rounds: int, rival: State | None = None) -> State:
+    def converged(self, rounds: int, rival: State | None = None) -> State:
         """Return the state with all that may move fitted on the windows for training.
 
         Args:
@@ -130,7 +131,7 @@ class State:
     @property
     def _beside(self) -> bool:
         """Whether the values are about those of the last linear model, and not nominal but for the terms."""
-        return any(key[0] not in (*self.terms, *self.loosened) for key in self.theta)
+        return any(key[0] not in (*self.terms, *self.relaxed) for key in self.theta)
 
     def _nearby(self) -> Table | None:
         """Return a linear model about the values for a first round, with columns of a model that was measured before.
@@ -158,10 +159,10 @@ class State:
         chi2 = self.scorer.chi2(fitted.residual, fitted.windows)
         return replace(self, theta=theta, fitted=fitted, chi2=chi2)
 
-    def renewed(self) -> State:
+    def updated(self) -> State:
         """Return the state with floors and initial states that suit its values."""
-        assert self.scorer.renewed is not None
-        return replace(self, scorer=self.scorer.renewed(self.theta))
+        assert self.scorer.updated is not None
+        return replace(self, scorer=self.scorer.updated(self.theta))
 
     def finer(self) -> State:
         """Return the state whose residuals are replayed at a finer step, by the same floors; on the ground itself.
@@ -196,3 +197,138 @@ class State:
         """Return chi2 (V, G) of some values, or the present ones, on windows no fit has seen."""
         theta = self.theta if theta is None else theta
         return scores(self.scorer, [theta], self.splits.select if windows is None else windows, self.dt)[0]
+
+
+@dataclass(frozen=True)
+class LastCheck:
+    """What terms do on windows that no decision has seen.
+
+    Attributes:
+        helps: whether most windows gain, or there is no gap; true without such windows.
+        closed: share of the excess chi-squared there that is gone; NaN without such windows, or without a gap there.
+    """
+
+    helps: bool
+    closed: float
+
+
+@dataclass(frozen=True)
+class Search:
+    """What is known so far in a search. Each step of a search returns a new one.
+
+    Attributes:
+        state: the present model, with its windows and settings.
+        rng: of tests and bootstraps; drawn from in the order of the steps.
+        progress: called with what is being done, and which share of all is finished.
+        select_chi2: (V, G) chi2 per value of the present model on held-out windows.
+        nominal: values of the model within its tolerances, before any term.
+        first: held-out excess chi-squared with these.
+        aliases: effect -> effects that do as well.
+        shares: effect -> share of bootstraps in which it is selected.
+        candidates: the evidence.
+        signal: effect -> chi2 that it would add at twice its tolerance.
+        steps: (what, held-out excess chi-squared) after every accepted term.
+        base: which of the steps is the model within its tolerances, without a term.
+        single: the term that explains nearly everything alone, or empty (``gap/search/single_cause.py``).
+        within: values within tolerances, shared by all joints, at which a fit on the ground begins.
+        marginal: whether the first term was accepted although the tolerances explain the data nearly as well.
+        rivals: fitted models that nearly did as well as the first term, best first.
+        returned: term -> share of the excess chi-squared that came back without it, in the last test of it.
+    """
+
+    state: State
+    rng: np.random.Generator
+    progress: Callable[[str, float], None]
+    select_chi2: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
+    nominal: Theta = field(default_factory=dict)
+    first: float = math.nan
+    aliases: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    shares: Mapping[str, float] = field(default_factory=dict)
+    candidates: tuple[Candidate, ...] = ()
+    signal: Mapping[str, float] = field(default_factory=dict)
+    steps: tuple[tuple[str, float], ...] = ()
+    base: int = 0
+    single: str = ""
+    within: Theta = field(default_factory=dict)
+    marginal: bool = False
+    rivals: tuple[Model, ...] = ()
+    returned: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def splits(self) -> Splits:
+        """Which windows are for what."""
+        return self.state.splits
+
+    @property
+    def settings(self) -> GapSettings:
+        """The user's settings."""
+        return self.state.settings
+
+    @property
+    def dt(self) -> float:
+        """Physics step, s."""
+        return self.state.dt
+
+    def last_check(self) -> LastCheck:
+        """Return what the terms do on the windows kept for a last check."""
+        kept = self.splits.confirm
+        if not len(kept):
+            return LastCheck(True, math.nan)
+        before, after = (self.state.held_out(theta, kept) for theta in (self.nominal, self.state.theta))
+        level = excess(before)
+        least = 0.0 if level > self.settings.material else -thresholds.SAME_GAIN
+        helps = bool(significance.gains(before, after[None]).mean() > least)
+        return LastCheck(helps, removed(level, excess(after)) if level > self.settings.adequate else math.nan)
+
+    def share_of(self, term: str) -> float:
+        """Return the share of the excess within the tolerances that comes back without a term; NaN if not tested."""
+        if self.state.terms == (term,):
+            return removed(self.first, excess(self.select_chi2))
+        return self.returned.get(term, math.nan)
+
+    def removes(self, term: str) -> float:
+        """Return the share of the excess without a term that the term removes; NaN if not tested.
+
+        Beside a large effect a small one has little of the whole excess, and may still be all that is left without it.
+        """
+        back = self.share_of(term) * self.first
+        without = back + max(excess(self.select_chi2), 0.0)
+        return back / without if without > 0.0 else math.nan
+
+    # ------------------------------------------------------------------ the next state
+
+    def with_model(self, state: State, chi2: np.ndarray, step: str) -> Search:
+        """Return the search with another model, its held-out chi2 (V, G), and a step that names it."""
+        return replace(self, state=state, select_chi2=chi2, steps=(*self.steps, (step, excess(chi2))))
+
+    def measured_again(self, first: float) -> Search:
+        """Return the search with this held-out excess within the tolerances, by the floors of the present terms."""
+        steps = list(self.steps)
+        steps[self.base] = (steps[self.base][0], first)
+        return replace(self, first=first, steps=tuple(steps))
+
+    def withdrawn(self, why: str) -> Search:
+        """Return the search without its terms."""
+        search = self.rejected(self.state.terms, why)
+        state = replace(self.state, terms=(), theta=self.nominal)
+        return replace(search, state=state, steps=(*self.steps, ("withdrawn", self.first)))
+
+    def rejected(self, names: Sequence[str], why: str) -> Search:
+        """Return the search with these accepted candidates rejected in the evidence."""
+        candidates = tuple(
+            replace(c, status="rejected", reason=why) if c.status == "accepted" and c.effect in names else c
+            for c in self.candidates
+        )
+        return replace(self, candidates=candidates)
+
+
+def begun(
+    scorer: Scorer,
+    splits: Splits,
+    settings: GapSettings,
+    dt: float,
+    rng: np.random.Generator,
+    progress: Callable[[str, float], None] = lambda what, share: None,
+) -> Search:
+    """Return a search at its beginning: a model without terms, at its nominal values."""
+    return Search(State(scorer, splits, settings, dt), rng, progress)

@@ -14,8 +14,7 @@ from go1exp.gap.search import candidates, reduction, significance, single_cause,
 from go1exp.gap.search.candidates import Trial, tried
 from go1exp.gap.search.fit import Model, fit, misfit
 from go1exp.gap.search.screen import Screened, library, motion, outside, rivals, screen
-from go1exp.gap.search.search import Search
-from go1exp.gap.search.state import State
+from go1exp.gap.search.state import Search, State
 from go1exp.sim.effects.tolerances import sizes
 
 # ---------------------------------------------------------------------- the search
@@ -28,7 +27,7 @@ def run(search: Search) -> Search:
         search, cause = alone(search)
     if cause is None and search.within and search.settings.calibrate:
         # Joints that are all off within their tolerances: a fit at states of the nominal model finds a poor optimum.
-        search = replace(search, state=replace(search.state, theta=search.within).renewed())
+        search = replace(search, state=replace(search.state, theta=search.within).updated())
     search = fit_nominal(search)
     if cause is not None:
         search.progress(f"fitting the model with {cause.name}", 0.2)
@@ -40,27 +39,27 @@ def run(search: Search) -> Search:
         search.progress("is all of it needed", 0.85)
         search = reduction.reduced(search)
     sizes_of_terms = [candidates.size(t, search.state.theta, search.state.tolerances) for t in search.state.terms]
-    if search.strained and sizes_of_terms and max(sizes_of_terms) <= thresholds.CLEARLY_BEYOND:
+    if search.marginal and sizes_of_terms and max(sizes_of_terms) <= thresholds.CLEARLY_BEYOND:
         return search.withdrawn("it leaves its tolerance by too little to be called missing")
     return search
 
 
 def alone(search: Search) -> tuple[Search, Model | None]:
     """Look for the effect of the whole robot that explains nearly everything alone; return it, if there is one."""
-    search, sought = single_cause.cause(search, judged)
+    search, sought = single_cause.cause(search, held_out_test)
     return replace(search, single=sought.best.name if sought.best else "", within=sought.within), sought.best
 
 
 def with_signals(search: Search) -> Search:
     """Return the search with how much each effect would show (``signal``), and nothing else."""
-    search = replace(search, state=search.state.settled(1))
+    search = replace(search, state=search.state.converged(1))
     return noting_signals(search, screened_by(search))
 
 
 def fit_nominal(search: Search) -> Search:
     """Return the search with the model fitted within its tolerances."""
     search.progress("fitting the model within its tolerances", 0.1)
-    state = search.state.settled(3)
+    state = search.state.converged(3)
     chi2 = state.held_out()
     search = search.with_model(state, chi2, "within tolerances")
     return replace(search, nominal=state.theta, first=excess(chi2))
@@ -79,20 +78,20 @@ def advance(search: Search) -> tuple[Search, bool]:
     search.progress(f"fitting candidates for term {term}", share + 0.06)
     search, fitted = at_active_bounds(search, screened) if small else (search, fitted_candidates(search, screened))
     now = (search.state, search.state.train_chi2, search.select_chi2)
-    search, accepted, inside = judged(search, fitted, *now, small)
+    search, accepted, inside = held_out_test(search, fitted, *now, small)
     if accepted is None and inside is None and not small and excess(search.select_chi2) <= search.settings.adequate:
         # Little is left, and nothing alone removes it: several tolerances may make up for what is missing.
         small = True
         search, fitted = at_active_bounds(search, screened)
-        search, accepted, inside = judged(search, fitted, *now, small)
+        search, accepted, inside = held_out_test(search, fitted, *now, small)
     if accepted is not None:
         search.progress(f"fitting the model with {accepted.name}", share + 0.12)
-        search = replace(search, strained=search.strained or (small and not search.state.terms))
+        search = replace(search, marginal=search.marginal or (small and not search.state.terms))
         return accept(search, accepted)
-    if inside is None or len(search.state.loosened) == thresholds.MOST_RELAXED:
+    if inside is None or len(search.state.relaxed) == thresholds.MOST_RELAXED:
         return search, False
     search.progress(f"fitting the model with {inside.name}", share + 0.12)
-    return loosened(search, inside), True
+    return relaxed(search, inside), True
 
 
 def accept(search: Search, model: Model) -> tuple[Search, bool]:
@@ -107,17 +106,17 @@ def accept(search: Search, model: Model) -> tuple[Search, bool]:
 def with_term(search: Search, model: Model) -> Search:
     """Return the search with a candidate as a term and all else refitted."""
     terms = (*search.state.terms, model.name)
-    others = tuple(name for name in search.state.loosened if name != model.name)
+    others = tuple(name for name in search.state.relaxed if name != model.name)
     # What the box had taken on in place of the effect it gives back: it starts from the nominal values.
     theta = {key: value for key, value in model.theta.items() if key[0] in (*terms, *others)}
-    state = replace(search.state, terms=terms, loosened=others, theta=theta)
-    renews, held = state.scorer.renewed is not None, not state.machine.on_ground
-    if renews and (held or model.name == search.single):
+    state = replace(search.state, terms=terms, relaxed=others, theta=theta)
+    updates, held = state.scorer.updated is not None, not state.machine.on_ground
+    if updates and (held or model.name == search.single):
         # Initial states that suit the plain model give the truth twice the floor's chi2 under a loaded link.
-        state = state.renewed()
-    state = state.settled(4)
-    if renews:
-        state = state.renewed().settled(2 if held else 1)
+        state = state.updated()
+    state = state.converged(4)
+    if updates:
+        state = state.updated().converged(2 if held else 1)
     chi2, plain = state.held_out(), state.held_out(model.theta)
     # With little data, what was fitted from scratch can be a poorer optimum.
     if excess(plain) < excess(chi2) - thresholds.SAME_GAIN:
@@ -126,10 +125,10 @@ def with_term(search: Search, model: Model) -> Search:
     return search.with_model(state, chi2, model.name)
 
 
-def loosened(search: Search, model: Model) -> Search:
+def relaxed(search: Search, model: Model) -> Search:
     """Return the search with an effect that may move within its tolerance."""
-    names = (*search.state.loosened, model.name)
-    state = replace(search.state, loosened=names, theta=model.theta).settled(2)
+    names = (*search.state.relaxed, model.name)
+    state = replace(search.state, relaxed=names, theta=model.theta).converged(2)
     chi2, base = state.held_out(), len(search.steps)
     without_terms = not search.state.terms
     search = search.with_model(state, chi2, f"{model.name} within its tolerance")
@@ -144,7 +143,7 @@ def screened_by(search: Search) -> list[Screened]:
     state = search.state
     linear, machine = state.table, state.machine
     moved = motion(state.scorer.windows, machine.effort)
-    variants = library(machine, moved, [*state.terms, *state.loosened])
+    variants = library(machine, moved, [*state.terms, *state.relaxed])
     if search.settings.effects:
         variants = [v for v in variants if v.effect in search.settings.effects]
     count, half = len(linear.windows), thresholds.SCREENED_WINDOWS // 2
@@ -176,7 +175,7 @@ def at_active_bounds(search: Search, screened: Sequence[Screened]) -> tuple[Sear
     values = tolerances.values(state.scorer, state.table)
     wanted = search.settings.effects
     unasked = [e for e in within if wanted and e not in wanted]
-    active = tolerances.straining(relief, values, [*state.terms, *unasked])
+    active = tolerances.active_bounds(relief, values, [*state.terms, *unasked])
     missing = outside(screened, within)
     if not active and not missing:
         if not state.terms:  # beside a term they are no rivals of it
@@ -211,8 +210,8 @@ def refitted(state: State, effect: str, theta: Theta, rounds: int = 2) -> Model:
         rounds: of fitting, at most.
     """
     terms = (*state.terms, effect)
-    kept = {key: value for key, value in theta.items() if key[0] in (*terms, *state.loosened)}
-    state = replace(state, terms=terms, theta=kept).settled(rounds)
+    kept = {key: value for key, value in theta.items() if key[0] in (*terms, *state.relaxed)}
+    state = replace(state, terms=terms, theta=kept).converged(rounds)
     return Model(effect, state.theta, state.may, sizes(effect), state.train_chi2, state.table.residual)
 
 
@@ -258,7 +257,7 @@ def fitted_on(search: Search, fitted: Sequence[Model]) -> list[Model]:
 # ---------------------------------------------------------------------- held-out tests
 
 
-def judged(
+def held_out_test(
     search: Search,
     fitted: Sequence[Model],
     state: State,

@@ -279,7 +279,7 @@ def relief(scorer: Scorer, linear: Table, may: Freedom) -> dict[str, float]:
     return {effect: smallest(may) - smallest(may.also(effect)) for effect in effects}
 
 
-def straining(relieved: Mapping[str, float], count: float, but: Collection[str]) -> list[str]:
+def active_bounds(relieved: Mapping[str, float], count: float, but: Collection[str]) -> list[str]:
     """Return the effects that would leave their tolerance if they might, the one that gains most first.
 
     Args:

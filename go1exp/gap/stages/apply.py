@@ -77,7 +77,7 @@ def write(result: GapResult, folder: Path) -> tuple[Path, ...]:
     rest = [n for n in result.named if n.status != "certified"]
     written = []
     for name, about, lines in (
-        (EFFECT, "What the model lacks.", _named_lines(certified)),
+        (EFFECT, "Missing effects.", _named_lines(certified)),
         (
             CALIBRATION,
             "The model's own parameters, within their tolerances.",
@@ -269,7 +269,7 @@ def prove(
         comparison = compare(recordings, robot, settings, physics_dt=physics_dt, fewest=1)
         if comparison.robot.on_ground:
             _same_contact(comparison.robot.tolerances, tolerances_of(result))
-        windows = _judged(comparison, result)
+        windows = _windows(comparison, result)
         values = _proposals(contents, robot)
         plain, effect_only, both = (excess(_held_out(comparison, theta, windows)) for theta in values)
     reported = _reported(result)
@@ -315,12 +315,12 @@ def _by_clock(robot: Robot, result: GapResult) -> Robot:
 
 def _proposals(contents: Mapping[str, Mapping[str, Any]], robot: Robot) -> tuple[Theta, Theta, Theta]:
     """Return the values of the plain model, with ``effect.yaml``, and with ``calibration.yaml`` as well."""
-    calibration, lacking = contents.get(CALIBRATION, {}), contents.get(EFFECT, {})
-    effect, both = (theta_of(terms_of(c), robot.joints) for c in (lacking, composed(calibration, lacking)))
+    calibration, missing = contents.get(CALIBRATION, {}), contents.get(EFFECT, {})
+    effect, both = (theta_of(terms_of(c), robot.joints) for c in (missing, composed(calibration, missing)))
     return {}, effect, both
 
 
-def _judged(comparison: Comparison, result: GapResult) -> np.ndarray:
+def _windows(comparison: Comparison, result: GapResult) -> np.ndarray:
     """Return the windows on which the search scored what it wrote: another split would be of other windows.
 
     Raises:
@@ -329,7 +329,7 @@ def _judged(comparison: Comparison, result: GapResult) -> np.ndarray:
     count, numbers = result.provenance.get("windows"), result.provenance.get("judged")
     if not numbers:  # an older version's result
         parts = comparison.split(np.random.default_rng(comparison.settings.seed))
-        return parts.judged
+        return parts.evaluated
     if count != len(comparison.windows):
         now = len(comparison.windows)
         raise GapFileError(f"logs: {now} windows, {count} in the search that found this; run go1exp gap explain again")
@@ -338,6 +338,6 @@ def _judged(comparison: Comparison, result: GapResult) -> np.ndarray:
 
 def _held_out(comparison: Comparison, theta: Theta, windows: np.ndarray) -> np.ndarray:
     """Return chi2 (V, G) of a model on some windows, by floors and initial states that suit it."""
-    renewed = comparison.scorer.renewed
-    scorer = comparison.scorer if renewed is None or not theta else renewed(theta)
+    updated = comparison.scorer.updated
+    scorer = comparison.scorer if updated is None or not theta else updated(theta)
     return scores(scorer, [theta], windows, comparison.dt)[0]

@@ -15,7 +15,7 @@ from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score.angle_errors import localise
 from go1exp.gap.score.likelihood import excess
 from go1exp.gap.search.fit import residuals
-from go1exp.gap.search.search import begun
+from go1exp.gap.search.state import begun
 from go1exp.gap.search.stepwise import with_signals
 from go1exp.logs.recording import Recording
 from go1exp.robot.config import RobotConfig
@@ -62,7 +62,7 @@ class CheckResult:
                 line += f", repetitions differ by {self.floors.repeatability[name]:.2g}"
             lines.append(line)
         if self.not_excited:
-            lines.append("not excited, so not to be judged from these logs; record next:")
+            lines.append("not identifiable from these logs; record next:")
             lines += [f"  {effect}: {excitation}" for effect, excitation in self.not_excited.items()]
         return "\n".join(lines)
 
@@ -94,12 +94,14 @@ def check(
         rng = np.random.default_rng(settings.seed)
         plain = residuals(score, [{}], everything, comparison.dt)[0]
         where = localise(score, plain, everything, rng)
-        silent = None
+        unexcited = None
         if screen:
             on_progress("what these logs can show", 0.6)
             parts = comparison.split(rng)
             search = with_signals(begun(score, parts, comparison.settings, comparison.dt, rng))
-            silent = not_excited(search.signal, held=can_stand(comparison.robot))
+            unexcited = not_excited(search.signal, held=can_stand(comparison.robot))
     on_progress("done", 1.0)
     error_of_all = excess(score.chi2(plain, everything))
-    return CheckResult((), comparison.floors(), len(everything), error_of_all, where, silent, comparison.ready.warnings)
+    return CheckResult(
+        (), comparison.floors(), len(everything), error_of_all, where, unexcited, comparison.ready.warnings
+    )

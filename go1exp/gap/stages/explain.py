@@ -22,7 +22,7 @@ from go1exp.gap.score.angle_errors import angle_errors, localise
 from go1exp.gap.score.likelihood import Scorer, excess
 from go1exp.gap.search import clocks
 from go1exp.gap.search.fit import residuals
-from go1exp.gap.search.search import Search, begun
+from go1exp.gap.search.state import Search, begun
 from go1exp.gap.search.stepwise import run
 from go1exp.gap.search.tolerances import identification
 from go1exp.gap.sentence import advice, sentence
@@ -31,10 +31,10 @@ from go1exp.robot.config import RobotConfig
 from go1exp.sim.effects.tolerances import declared
 
 FEWEST_SWINGS = 24
-"""Windows of legs in the air below which nothing is judged: each shows some of the legs only."""
+"""Windows of legs in the air below which nothing is tested: each shows some of the legs only."""
 
 SWING_ALONE = (
-    "Only legs in the air were compared, so trunk, feet and ground were not judged; search.phase=whole compares all."
+    "Only legs in the air were compared, so trunk, feet and ground were not tested; search.phase=whole compares all."
 )
 
 
@@ -46,8 +46,8 @@ def explain(
 ) -> GapResult:
     """Compare recordings of a robot with its model, and name what is missing.
 
-    Of a robot that walks, the legs in the air come first: they show what joints lack whatever the ground does. If they
-    name something, that is the answer. Otherwise the robot on its feet is compared too (``settings.phase``).
+    Of a robot that walks, the legs in the air come first: they show effects at joints whatever the ground does. If they
+    name something, that is the answer. Otherwise the standing robot is compared too (``settings.phase``).
 
     Args:
         recordings: of one robot.
@@ -119,7 +119,7 @@ def searched(comparison: Comparison, rng: np.random.Generator, warnings: list[st
     settings, parts = comparison.settings, comparison.split(rng)
     if parts.alone:
         warnings.append(
-            f"Of {len(parts.alone)} episodes there is no other with the same motion and gains; stretches of them judge "
+            f"Of {len(parts.alone)} episodes there is no other with the same motion and gains; stretches of them test "
             "what was fitted on the rest of them."
         )
     if parts.shared:
@@ -155,13 +155,13 @@ def written(
     score, parts, settings, dt = search.state.scorer, search.splits, search.settings, search.dt
     shown = np.sort(np.concatenate([parts.select, parts.confirm]))
     before, after = residuals(score, [{}, search.state.theta], shown, dt)
-    silent = not_excited(search.signal, held=can_stand(comparison.robot))
+    unexcited = not_excited(search.signal, held=can_stand(comparison.robot))
     suggestions = advice({n.effect: n.alias_set for n in answer.named})
     named = {n.effect: n for n in answer.named}
     of_clock = [clocks.sentence(comparison.clock)] if comparison.clock else []
     return GapResult(
         verdict=answer.verdict,
-        sentence=" ".join([sentence(answer, search, silent, suggestions), *of_clock]),
+        sentence=" ".join([sentence(answer, search, unexcited, suggestions), *of_clock]),
         named=answer.named,
         candidates=evidence(search),
         floors=comparison.floors(),
@@ -170,7 +170,7 @@ def written(
         errors=_angle_errors(comparison, search),
         before=localise(score, before, shown, search.rng),
         after=localise(score, after, shown, search.rng),
-        not_excited=silent,
+        not_excited=unexcited,
         advice=suggestions,
         bootstrap_share=dict(search.shares),
         waterfall=(("nominal model", answer.excess["null"]), *search.steps),
@@ -187,8 +187,8 @@ def written(
 
 def _angle_errors(comparison: Comparison, search: Search) -> AngleErrors:
     """Return the errors of the angles before and after, on windows that no fitted value has seen."""
-    windows, plain, theta = search.splits.judged, comparison.scorer, search.state.theta
-    # The same floors for both, whatever was named; only a trunk on a mount has a first state that a bolted one has not.
+    windows, plain, theta = search.splits.evaluated, comparison.scorer, search.state.theta
+    # The same floors for both, whatever was named; only a trunk on a mount has an initial state of its own.
     last = search.state.scorer if search.state.scorer.common.any() else plain
     (before,), (after,) = (residuals(s, [values], windows, search.dt) for s, values in ((plain, {}), (last, theta)))
     names = [r.meta.episode for r in comparison.recordings]
@@ -209,7 +209,7 @@ def provenance(
         "seed": settings.seed,
         "physics_dt": comparison.dt,
         "windows": len(comparison.windows),
-        "judged": [int(k) for k in parts.judged],
+        "judged": [int(k) for k in parts.evaluated],
         "split": {name: sorted({recordings[e].meta.episode for e in episode[w]}) for name, w in kinds.items()},
     }
 

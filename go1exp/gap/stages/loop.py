@@ -7,8 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from go1exp.gap.comparison import Progress
-from go1exp.gap.design.plan import DesignError
-from go1exp.gap.design.settings import DesignSettings
+from go1exp.gap.design.plan import DesignError, DesignSettings
 from go1exp.gap.result import GapResult, GapSettings
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.stages.explain import explain
@@ -28,7 +27,7 @@ class Round:
         recordings: how many there are.
         robot_seconds: of all recordings so far.
         verdict: of the search.
-        names: effects that are named, each with the rivals that are not settled behind it; without a design, with
+        names: effects that are named, each with the rivals that are not yet excluded behind it; without a design, with
             those that the search took for its equals.
         power: least chance to tell a name from a rival, by the recordings so far; 1 if no rival is left. None if that
             is not known: nothing is named, or no design could be made.
@@ -61,7 +60,7 @@ class Turn:
 
 
 def names_left(result: GapResult, planned: NextResult | None) -> tuple[tuple[str, ...], ...]:
-    """Return each named effect, and behind it the rivals that are not settled, or its equals where none was judged."""
+    """Return each named effect, and behind it the rivals that are not yet excluded, or its equals without a design."""
     if planned is None:
         return tuple((n.effect, *(a for a in n.alias_set if a != n.effect)) for n in result.named)
     return tuple((n.effect, *(p.rival for p in planned.pairs if p.truth == n.effect and p.rival)) for n in result.named)
@@ -90,7 +89,7 @@ def loop(
     on_round: Callable[[Turn], None],
     on_progress: Progress = lambda what, share: None,
 ) -> list[Round]:
-    """Close the circle: no one is asked anything in between.
+    """Close the loop without a user in between.
 
     Args:
         rig: the hidden robot.

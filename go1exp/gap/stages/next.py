@@ -13,10 +13,9 @@ import numpy as np
 from go1exp.base.tensors.threads import one_thread
 from go1exp.gap.comparison import Comparison, Progress, compare, robot_from
 from go1exp.gap.data.prepare import fingerprint
-from go1exp.gap.design.choice import COARSE, ENOUGH, Choice, Judge, Pair, Worth, choose
-from go1exp.gap.design.plan import Attitude, DesignError, limits_of
+from go1exp.gap.design.choice import COARSE, ENOUGH, Choice, Evaluator, Pair, Worth, choose
+from go1exp.gap.design.plan import Attitude, DesignError, DesignSettings, limits_of
 from go1exp.gap.design.rehearsal import Rehearsal, Stage
-from go1exp.gap.design.settings import DesignSettings
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import Candidate, GapResult, GapSettings, NamedEffect
 from go1exp.gap.robots.protocol import Robot
@@ -64,8 +63,8 @@ class NextResult:
 
     Attributes:
         verdict: ``designed``, ``nothing left``, or ``not separable``.
-        pairs: what is told apart and what is not.
-        settled: pairs that the recordings at hand tell apart already, in words.
+        pairs: which are distinguishable, and which are not.
+        distinguishable: pairs that the recordings at hand distinguish already, in words.
         best: the design; None if there is none.
         rate_hz: of its commands, Hz.
         joints: their names.
@@ -75,7 +74,7 @@ class NextResult:
 
     verdict: str
     pairs: tuple[Verdict, ...]
-    settled: tuple[str, ...]
+    distinguishable: tuple[str, ...]
     best: Rehearsal | None
     rate_hz: float
     joints: tuple[str, ...]
@@ -96,7 +95,13 @@ class NextResult:
             design["seconds"] = self.seconds
         pairs = [{**asdict(p), "separable": not p.reason} for p in self.pairs]
         about = {"rate_hz": self.rate_hz, "joints": list(self.joints), "tried": self.tried, "beyond": self.beyond}
-        return {"verdict": self.verdict, "design": design, "pairs": pairs, "settled": list(self.settled), **about}
+        return {
+            "verdict": self.verdict,
+            "design": design,
+            "pairs": pairs,
+            "settled": list(self.distinguishable),
+            **about,
+        }
 
 
 def model_of(result: GapResult, robot: Robot) -> Theta:
@@ -127,7 +132,7 @@ def pairs_of(result: GapResult, robot: Robot) -> list[Pair]:
     """
     if result.verdict in ("bad log", "unexplained"):
         raise DesignError(
-            f"the result is {result.verdict!r}: it names nothing that could be told from something else; "
+            f"the result is {result.verdict!r}: it names nothing that could be distinguished from something else; "
             "mend the logs, or record more kinds of motion"
         )
     theta = model_of(result, robot)
@@ -198,12 +203,12 @@ def attitudes(robot: Robot, comparison: Comparison, settings: DesignSettings) ->
     return [Attitude(None, None, quat) for quat in quats if quat is not None]
 
 
-def reason(judge: Judge, reached: Worth, choice_beyond: int, settings: DesignSettings) -> str:
+def reason(evaluator: Evaluator, reached: Worth, choice_beyond: int, settings: DesignSettings) -> str:
     """Return why no design tells a pair apart."""
     best = f"no design reaches more than {reached.power:.0%}"
-    if judge.pair.rival:
+    if evaluator.pair.rival:
         share = f"all but {1.0 - reached.imitated:.1g}"
-        why = f"{judge.pair.rival} imitates {share} of what {judge.pair.truth} does in the best one"
+        why = f"{evaluator.pair.rival} imitates {share} of what {evaluator.pair.truth} does in the best one"
     else:
         why = f"twice its tolerance changes chi2 by {reached.gain:.2g} per value there"
     fixed = [name for name, kept in (("gains", settings.gains), ("hang", settings.hang)) if len(kept) == 1]
@@ -249,36 +254,38 @@ def design(
         if not comparison.windows.kp.any():
             raise DesignError("gap next designs motions of drives that follow angles; these are commanded torques")
         on_progress("what the recordings at hand tell apart", 0.1)
-        settled: list[str] = []
-        for pairs in lots:  # names first: what was not excited waits until they are settled
-            judges, before = _left(pairs, comparison, result, settled)
-            if judges:
+        distinguishable: list[str] = []
+        for pairs in lots:  # names first: what was not excited waits until they are distinguishable
+            evaluators, before = _left(pairs, comparison, result, distinguishable)
+            if evaluators:
                 break
         else:
-            return NextResult("nothing left", (), tuple(settled), None, rate, robot.joints)
+            return NextResult("nothing left", (), tuple(distinguishable), None, rate, robot.joints)
         stage = Stage(comparison, limits, model_of(result, robot), settings.seconds)
         rate = 1.0 / stage.period
-        choice = choose(stage, judges, attitudes(robot, comparison, settings), settings, on_progress)
+        choice = choose(stage, evaluators, attitudes(robot, comparison, settings), settings, on_progress)
     on_progress("done", 1.0)
-    verdicts = _verdicts(judges, before, choice, settings)
+    verdicts = _verdicts(evaluators, before, choice, settings)
     verdict = "designed" if choice.best else "not separable"
-    return NextResult(verdict, verdicts, tuple(settled), choice.best, rate, robot.joints, choice.tried, choice.beyond)
+    return NextResult(
+        verdict, verdicts, tuple(distinguishable), choice.best, rate, robot.joints, choice.tried, choice.beyond
+    )
 
 
 def _left(
-    pairs: Sequence[Pair], comparison: Comparison, result: GapResult, settled: list[str]
-) -> tuple[list[Judge], list[Worth]]:
-    """Return the pairs that the recordings at hand leave open, and what they say of each; note the ``settled`` ones."""
-    judges, before = list[Judge](), list[Worth]()
+    pairs: Sequence[Pair], comparison: Comparison, result: GapResult, distinguishable: list[str]
+) -> tuple[list[Evaluator], list[Worth]]:
+    """Return the pairs that the recordings at hand leave open, and their worth; note the ``distinguishable`` ones."""
+    evaluators, before = list[Evaluator](), list[Worth]()
     for pair in pairs:
-        judge = Judge(pair, comparison.scorer, comparison.settings, COARSE * comparison.dt)
-        worth = judge.worth(judge.at_hand)
+        evaluator = Evaluator(pair, comparison.scorer, comparison.settings, COARSE * comparison.dt)
+        worth = evaluator.worth(evaluator.at_hand)
         if worth.power < ENOUGH or _equal(pair, result):
-            judges.append(judge)
+            evaluators.append(evaluator)
             before.append(worth)
         else:
-            settled.append(_shown(pair, worth))
-    return judges, before
+            distinguishable.append(_shown(pair, worth))
+    return evaluators, before
 
 
 def _shown(pair: Pair, worth: Worth) -> str:
@@ -293,14 +300,14 @@ def _equal(pair: Pair, result: GapResult) -> bool:
 
 
 def _verdicts(
-    judges: Sequence[Judge], before: Sequence[Worth], choice: Choice, settings: DesignSettings
+    evaluators: Sequence[Evaluator], before: Sequence[Worth], choice: Choice, settings: DesignSettings
 ) -> tuple[Verdict, ...]:
     listed = []
-    for judge, at_hand, after, reached in zip(judges, before, choice.worths, choice.reach, strict=True):
-        why = "" if after.power >= ENOUGH else reason(judge, reached, choice.beyond, settings)
+    for evaluator, at_hand, after, reached in zip(evaluators, before, choice.worths, choice.reach, strict=True):
+        why = "" if after.power >= ENOUGH else reason(evaluator, reached, choice.beyond, settings)
         if why and reached.power >= ENOUGH:
             why = f"another recording would with {reached.power:.0%}; run gap next again after this one"
-        listed.append(Verdict(judge.pair.truth, judge.pair.rival, at_hand, after, why))
+        listed.append(Verdict(evaluator.pair.truth, evaluator.pair.rival, at_hand, after, why))
     return tuple(listed)
 
 

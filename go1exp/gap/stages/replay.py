@@ -261,7 +261,7 @@ def _measured_trunk(recordings: Sequence[Recording], taken: Callable[[Sequence[n
     """Return the readings of the IMU, and the true velocity of the trunk where the recordings have it.
 
     Args:
-        recordings: of a robot on its feet.
+        recordings: of a standing robot.
         taken: returns the values (W, n, c) at the windows' sample times of each recording's values (T, c).
     """
     imu = [r.block(*AXES) for r in recordings]
