@@ -58,7 +58,7 @@ class Robots:
 
     config: RobotConfig = None  # type: ignore[assignment]
     held = SuspendedGo1(config)
-    standing = StandingGo1(config, held)
+    standing = StandingGo1(config, held=held)
 
 
 @pytest.fixture

@@ -59,12 +59,7 @@ class Answer:
 
 
 def concluded(search: Search, warnings: list[str]) -> tuple[Search, Answer]:
-    """Return the answer, and the search without the terms that held-out episodes or resamples do not support.
-
-    Args:
-        search: that is done.
-        warnings: to which what was withdrawn is added.
-    """
+    """Return the answer, and the search without the terms that held-out episodes or resamples do not support."""
     settings = search.settings
     plain = excess(search.state.held_out({}))
     check = search.last_check()
@@ -135,15 +130,7 @@ def share_accepted(search: Search) -> float:
 def name_terms(
     search: Search, theta: Theta, drawn: Mapping[Key, np.ndarray], adequate: bool, check: LastCheck
 ) -> tuple[NamedEffect, ...]:
-    """Return the accepted effects with intervals, at the joints where they leave their tolerances beyond doubt.
-
-    Args:
-        search: that accepted them.
-        theta: fitted values.
-        drawn: resampled values by parameter (B, J) or (B, 1).
-        adequate: whether the model with them counts as right.
-        check: what they do on the last check.
-    """
+    """Return the accepted effects with intervals, at the joints where they leave their tolerances beyond doubt."""
     joints, known = search.state.scorer.windows.joints, search.state.tolerances
     named = []
     for effect in search.state.terms:
@@ -152,7 +139,8 @@ def name_terms(
         reason = doubt(search, effect, theta, at, adequate, check)
         unsure = 0.0 if adequate else beside_a_gap(search, effect)
         if per_joint and not at:
-            at = (_strongest(per_joint, theta, joints, known),)
+            away = [np.broadcast_to(deviation(theta, key, known), len(joints)) for key in per_joint]
+            at = (joints[int(np.max(away, axis=0).argmax())],)  # the joint that is furthest from null
         params: dict[str, dict[str, float]] = {}
         interval: dict[str, dict[str, tuple[float, float]]] = {}
         for key in (key for key in theta if key[0] == effect):
@@ -180,15 +168,8 @@ def _joints_beyond(
 def weak_joints(search: Search, effect: str, theta: Theta, drawn: Mapping[Key, np.ndarray]) -> tuple[int, ...]:
     """Return the joints at which a term leaves its tolerance neither beyond doubt nor by much.
 
-    There all of the 95 % interval does not lie beyond the tolerance, and the value is off by less than ``MUCH`` of what
-    it is off by where it is most so. Other parameters that the tolerances hold a little too close end up there: a
-    strength of 1.06 at a calf, with 5 % tolerated, beside 0.71 at the hips.
-
-    Args:
-        search: that accepted it.
-        effect: the term.
-        theta: fitted values.
-        drawn: resampled values by parameter (B, J) or (B, 1).
+    There the 95 % interval reaches into the tolerance, and the deviation is less than ``MUCH`` of the largest one.
+    ``drawn`` holds resampled values (B, J) or (B, 1) by parameter.
     """
     joints, known = search.state.scorer.windows.joints, search.state.tolerances
     outside, strong = np.zeros(len(joints), dtype=bool), np.zeros(len(joints), dtype=bool)
@@ -208,8 +189,7 @@ def weak_joints(search: Search, effect: str, theta: Theta, drawn: Mapping[Key, n
 def bounded_joints(search: Search, effect: str, theta: Theta) -> tuple[int, ...]:
     """Return the joints at which a term lies on a bound of its parameter, unless it does at all of its joints.
 
-    A joint of which a recording tells little goes there, since others want it so: a hip of half its mass. If held-out
-    windows do not miss it, the rest of the term is worth its name.
+    A joint of which a recording shows little goes there, since others draw it there.
     """
     joints, known = search.state.scorer.windows.joints, search.state.tolerances
     if tolerances.identification(effect).common:
@@ -227,12 +207,6 @@ def beyond_doubt(effect: NamedEffect, known: Tolerances) -> bool:
         for name, p in params.items()
         for low, high in effect.interval.get(name, {}).values()
     )
-
-
-def _strongest(keys: Sequence[Key], theta: Theta, joints: Sequence[str], known: Tolerances) -> str:
-    """Return the joint that is furthest from null, in tolerances."""
-    away = [np.broadcast_to(deviation(theta, key, known), len(joints)) for key in keys]
-    return joints[int(np.max(away, axis=0).argmax())]
 
 
 def _named_places(per: str, joints: Sequence[str], at: Sequence[str]) -> tuple[int, dict[int, str]]:
@@ -264,14 +238,8 @@ def _intervals(
 def decide(search: Search, named: Sequence[NamedEffect], final: float, accepted: bool) -> Verdict:
     """Return the verdict.
 
-    Terms none of which is certain explain nothing, however near they bring the model to these logs: so near come some
-    to a robot that has none of them. Without resamples (``search.bootstraps=0``) their certainty is unknown.
-
-    Args:
-        search: that is done.
-        named: its terms.
-        final: held-out excess with them.
-        accepted: whether what remains is within what the user does not care about.
+    Terms none of which is certified explain nothing, however near they bring the model to these logs. Without resamples
+    (``search.bootstraps=0``) their certainty is unknown.
     """
     settings, first = search.settings, search.first
     level = [effect for effect, s in search.signal.items() if s >= thresholds.NOT_EXCITED]

@@ -221,7 +221,8 @@ def _compared_clocks(
     written = ready["recorded"].recordings
     steps = np.concatenate([np.diff(r.t) / np.median(np.diff(r.t)) for r in written])
     low, high = np.quantile(steps, (0.05, 0.95))
-    rate_hz = {name: _rates(r.recordings) for name, r in ready.items()}
+    rates = {n: [(len(r.t) - 1) / float(r.t[-1] - r.t[0]) for r in each.recordings] for n, each in ready.items()}
+    rate_hz = {name: (min(each), max(each)) for name, each in rates.items()}
     default = ClockChoice(DEFAULT_CLOCK, False, rate_hz=rate_hz, steps=(float(low), float(high)))
     compared = {r.meta.episode for r in written}
     without = [r.meta.episode for r in recordings if r.meta.episode in compared and not r.has("qd")]
@@ -259,12 +260,6 @@ def _compared_clocks(
 
 def _cut(robot: FixedBase, ready: Ready) -> Callable[[Sequence[Sequence[Place]]], Windows]:
     return lambda places: robot.windows(ready, places)
-
-
-def _rates(recordings: Sequence[Recording]) -> tuple[float, float]:
-    """Return the least and the largest rate of rows, Hz."""
-    rates = [(len(r.t) - 1) / float(r.t[-1] - r.t[0]) for r in recordings]
-    return min(rates), max(rates)
 
 
 def _last_check(recordings: Sequence[Recording], robot: FixedBase, settings: GapSettings) -> list[np.ndarray]:

@@ -53,14 +53,7 @@ def where(joints: Sequence[str], everyone: Sequence[str]) -> str:
 
 
 def sentence(answer: Answer, search: Search, unexcited: Mapping[str, str], suggestions: Sequence[str]) -> str:
-    """Put the answer into words.
-
-    Args:
-        answer: what the search comes to.
-        search: that is done.
-        unexcited: effects that the data cannot show.
-        suggestions: what to record next, a sentence each.
-    """
+    """Put the answer into words."""
     everyone = search.state.scorer.windows.joints
     first, final = 1.0 + answer.excess["box"], 1.0 + answer.excess["final"]
     parts = [
@@ -75,7 +68,12 @@ def sentence(answer: Answer, search: Search, unexcited: Mapping[str, str], sugge
         accepted = 1e3 * search.settings.accept
         parts.append(f"{answer.within:.0%} of the held-out windows are within the {accepted:.3g} mrad accepted.")
     if answer.verdict == "partly explained":
-        parts.append(_partly(answer, search.settings.adequate))
+        near = answer.excess["final"] <= search.settings.adequate
+        parts.append(
+            "That is near the floor, but nothing of what is named is certain, so it may stand for something else."
+            if near and not any(effect.status == "certified" for effect in answer.named)
+            else "The rest is explained by nothing in the library, so what is named may stand for something else."
+        )
     named = {effect.effect for effect in answer.named}  # a simpler one may have taken the place of what was accepted
     first_tried = [c for c in search.candidates if c.stage == 1 and c.effect not in named]
     rejected = [c.effect for c in first_tried if c.status == "rejected"][:2]
@@ -87,13 +85,6 @@ def sentence(answer: Answer, search: Search, unexcited: Mapping[str, str], sugge
     if quiet:
         parts.append(f"These logs cannot show {', '.join(quiet)}.")
     return " ".join([*filter(None, parts), *suggestions])
-
-
-def _partly(answer: Answer, adequate: float) -> str:
-    """Return why an answer that names something is not a full one."""
-    if answer.excess["final"] <= adequate and not any(effect.status == "certified" for effect in answer.named):
-        return "That is near the floor, but nothing of what is named is certain, so it may stand for something else."
-    return "The rest is explained by nothing in the library, so what is named may stand for something else."
 
 
 def _opening(verdict: Verdict, first: float, search: Search) -> str:

@@ -113,14 +113,7 @@ def pd(rows: Rows) -> Reference:
 
 
 def linear(train: Rows, train_group: np.ndarray, rows: Rows, group: np.ndarray) -> Reference:
-    """Fit one affine map per group of joints to the training rows and apply it to ``rows``.
-
-    Args:
-        train: training rows.
-        train_group: index of the net for each training row ``(R,)``.
-        rows: held-out rows.
-        group: index of the net for each held-out row.
-    """
+    """Fit one affine map per group of joints to the training rows and apply it to ``rows``; groups (R,) are by row."""
     torque = np.full(len(rows), np.nan)
     for k in np.unique(group):
         train_rows, predicted = train.take(train_group == k), group == k
@@ -199,17 +192,7 @@ def report(
     split: Split,
     target: str,
 ) -> Report:
-    """Compare predictions on held-out rows.
-
-    Args:
-        rows: the held-out rows.
-        net: the net's torque for each ``(R,)``, N m.
-        references: torques of the references.
-        limits: limits of the regimes.
-        episodes: names that ``rows.episode`` points to.
-        split: which episodes trained, validated and were held out.
-        target: ``tau_est`` or ``joint_torque``.
-    """
+    """Compare predictions on held-out rows: the net's (R,), N m, and the references'; ``episodes`` are their names."""
     torques = {"net": net} | {r.name: r.torque for r in references if r.torque is not None}
     regimes = masks(rows, limits)
     every = np.ones(len(rows), bool)

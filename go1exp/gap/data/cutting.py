@@ -43,13 +43,13 @@ def even_clock(recording: Recording) -> np.ndarray:
     period = float(np.median(np.diff(t)))
     number = np.concatenate([[0.0], np.cumsum(np.round(np.diff(t) / period))])  # from one stamp to the next: no drift
     period, offset = np.polyfit(number, t, 1)
-    late = t - (offset + period * number)
-    if len(t) < 20 or np.abs(late).max() < 1e-7 or np.any(np.diff(number) < 1) or np.abs(late).max() > 0.5 * period:
+    jitter = t - (offset + period * number)
+    if len(t) < 20 or np.abs(jitter).max() < 1e-7 or np.any(np.diff(number) < 1) or np.abs(jitter).max() > 0.5 * period:
         return t
     q, qd = recording.joint("q"), recording.joint("qd")
     whole = np.flatnonzero((np.diff(number, 2) == 0) & (np.diff(number)[:-1] == 1)) + 1
     bend = q[whole] - 0.5 * (q[whole - 1] + q[whole + 1])
-    shift = (late[whole] - 0.5 * (late[whole - 1] + late[whole + 1]))[:, None] * qd[whole]
+    shift = (jitter[whole] - 0.5 * (jitter[whole - 1] + jitter[whole + 1]))[:, None] * qd[whole]
     fast = np.abs(qd[whole]) > 1.0
     # Curvature has the sign of the acceleration, that of the jitter any.
     true_jitter = (bend * shift)[fast].sum() / max(float((shift**2)[fast].sum()), 1e-12)
@@ -112,8 +112,8 @@ def _changes(t: np.ndarray, values: np.ndarray, lo: float, hi: float) -> tuple[n
 def bridged(t: np.ndarray, target: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return times and targets with a row for every single lost sample, and the times of those that hide a step.
 
-    A target that changes with every sample changed at the lost one too; taking it for held there makes it late by a
-    sample, which is a gap of its own. Whether a target that stepped did so at the lost sample or after is unknown.
+    A target that changes with every sample changed at the lost one too; held, it would be late by a sample. When a target
+    stepped, at the lost sample or after, is unknown.
     """
     lost = np.flatnonzero(np.abs(np.diff(t) / period - 2.0) < 0.5)
     lost = lost[(lost >= 1) & (lost + 2 < len(t))]

@@ -249,14 +249,7 @@ def cut_standing(recordings: Sequence[Recording], settings: GapSettings, config:
 def _with_trunk(
     plain: Windows, legs: Legs, logs: Mapping[int, Log], bases: Mapping[tuple[int, float], Base]
 ) -> StandingWindows:
-    """Add to windows what concerns the trunk: its initial state, its IMU, and which feet carry weight.
-
-    Args:
-        plain: the windows.
-        legs: of the nominal robot.
-        logs: by number of the recording; none of a robot whose trunk is held.
-        bases: estimates by number of the recording and time, s.
-    """
+    """Add to windows what concerns the trunk: its initial state, its IMU, and which feet carry weight."""
     count, width = len(plain), len(plain.joints)
     imu, scale = np.zeros((*plain.t.shape, 1, width)), np.full((count, 1, width), np.inf)
     state, base_sd = np.tile(np.eye(13)[3], (count, 1)), np.tile(BASE_SD, (count, 1))

@@ -101,12 +101,7 @@ def foot_forces(config: RobotConfig, legs: Legs, log: Log, motion: TrunkMotion) 
 
 
 def swings(t: np.ndarray, forces: np.ndarray) -> list[tuple[int, float, float]]:
-    """Return which leg swings from when to when, s, in the order of their beginnings.
-
-    Args:
-        t: (T,) clock, s.
-        forces: (T, 4) upward forces on the feet, N.
-    """
+    """Return (leg, begin, end) of each swing, s, in order, from the upward forces (T, 4), N, at times (T,), s."""
     made = []
     for leg, force in enumerate(forces.T):
         air = np.concatenate([[False], force < LOADED, [False]])
@@ -116,13 +111,7 @@ def swings(t: np.ndarray, forces: np.ndarray) -> list[tuple[int, float, float]]:
 
 
 def places(air: Sequence[tuple[int, float, float]], begin: float, end: float) -> list[Place]:
-    """Return where windows may be: legs that swing nearly together share one.
-
-    Args:
-        air: what :func:`swings` returns.
-        begin: earliest time at which a window may begin, s.
-        end: time at which the recording ends, s.
-    """
+    """Return where windows may be, from ``begin`` to ``end``, s: legs that swing nearly together share one."""
     usable = [
         (leg, max(a + FIT_S + AFTER_S, begin), min(b - BEFORE_S, a + FIT_S + AFTER_S + BURN_S + LONGEST_S))
         for leg, a, b in air
@@ -209,15 +198,7 @@ def _noise_in_air(
     quantity: str,
     otherwise: np.ndarray,
 ) -> np.ndarray:
-    """Return the noise of a quantity (J,), from swings alone: in a walk every other stretch of it has an impact.
-
-    Args:
-        recordings: with the readings.
-        logs: the same on their clocks.
-        of_log: where legs swing, by recording.
-        quantity: its name.
-        otherwise: (J,) what counts where swings are too short or too few to tell.
-    """
+    """Return the noise of a quantity (J,) from swings, or ``otherwise`` (J,) where they are too short or too few."""
     noise = np.array(otherwise)
     for joint in range(len(noise)):
         pieces = [

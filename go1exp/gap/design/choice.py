@@ -51,7 +51,7 @@ class Pair:
     @property
     def name(self) -> str:
         """In words."""
-        return f"{self.truth} from {self.rival}" if self.rival else f"{self.truth} from nothing"
+        return f"{self.truth} vs. {self.rival or 'none'}"
 
 
 @dataclass(frozen=True)

@@ -169,10 +169,7 @@ class Stage:
     def scored(self, played: Sequence[Rehearsal], dt: float, few: int) -> Scorer:
         """Return what scores replays of designs: their windows, whose ``episode`` is the number of the design.
 
-        Args:
-            played: the designs.
-            dt: physics step, s.
-            few: windows of each to look at, at most, spread over the motion but for its beginning.
+        At most ``few`` windows of each, spread over the motion but for its beginning.
 
         Raises:
             RecordingError: if not one window fits.

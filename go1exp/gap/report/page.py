@@ -221,12 +221,7 @@ MOST_EPISODES = 6
 
 
 def text(result: GapResult, status: int | None = None) -> str:
-    """Return the summary for a terminal: plain text without markup, lines of up to 100 characters but for commands.
-
-    Args:
-        result: of the comparison.
-        status: exit status of the command, if it differs from the result's.
-    """
+    """Return the summary for a terminal: plain text without markup, lines of up to 100 characters but for commands."""
     code = result.exit_code if status is None else status
     lines = [f"{result.verdict.upper()} (exit code {code})", *_wrapped(result.sentence), ""]
     if result.named:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -40,53 +40,40 @@ NEEDED = ("t", "q", "qd", "q_target")
 """Channels, or quantities, without which nothing can be replayed."""
 
 
-def go1_flaws(recording: Recording, report: AuditReport, joints: tuple[str, ...], free: bool) -> list[str]:
-    """Return why a recording cannot be compared with a model of the Go1, a line each.
+NO_SENSORS = 1 << 13
+"""MuJoCo's mjDSBL_SENSOR: the IMU's readings follow from the motion of the base, and those of contacts cost time."""
 
-    Args:
-        recording: to compare.
-        report: of its audit.
-        joints: of the model.
-        free: whether the model's trunk is free; a recording of a held one can then be compared as well.
-    """
-    meta, name = recording.meta, recording.meta.episode
-    flaws = []
-    if meta.robot != GO1:
-        flaws.append(f"{name}: is of the robot {meta.robot!r}; the model is of {GO1!r}; {HINT}")
-    if meta.joints != joints:
-        flaws.append(f"{name}: has joints {', '.join(meta.joints)}; the model has {', '.join(joints)}")
-        return flaws
-    if meta.base != "fixed" and not free:
-        flaws.append(f"{name}: the trunk is free; only robots with a fixed base can be compared")
-    if meta.kp is None or meta.kd is None:
-        flaws.append(f"{name}: says no gains (kp, kd)")
-    flaws += [f"{name}: no {q}" for q in ("q", "qd", "q_target") if not recording.has(q)]
-    if free:
-        flaws += [f"{name}: no {quantity}" for quantity in missing(recording)]
-    # When a robot stands, its weight moves joints against their targets; a flipped sign is for the comparison to show.
-    telling = (*TELLING, "sign") if meta.base == "floating" else TELLING
-    if not flaws:
-        for flaw in report.flaws:
-            needed = flaw.channel in (*NEEDED, "all") or flaw.channel.startswith(("q_", "qd_"))
-            if flaw.verdict == "bad" and needed and flaw.check not in telling:
-                flaws.append(f"{name}: {flaw.channel}: {flaw.message}")
-    return flaws
+BASE_PROBE = (5.0e-4, 1.0e-3, 1.0e-3, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01)
+"""Changes of a base's initial height, roll, pitch, velocity and rate by which their influence is measured."""
+
+IMU_PROBE = (0.1, 0.1, 0.1, 0.02, 0.02, 0.02, 0.0005)
+"""Errors of accelerometer, m/s2, gyro, rad/s, and delay, s, by which the influence of the IMU is measured."""
+
+LEGS = tuple(tuple(range(3 * leg, 3 * leg + 3)) for leg in range(robot.NUM_LEGS))
+ON_MUJOCO = DECLARED.on(MUJOCO_CONTACT)
 
 
+@dataclass(frozen=True)
 class Go1:
     """Base of the Go1's kinds of comparison.
 
     Attributes:
         config: of the robot.
         joints: names.
+        groups: joints that feel each other.
+        base_probe: as for :class:`~go1exp.gap.replay.rows.Machine`.
         on_ground: whether it stands.
+        tolerances: of nominal parameters.
         free_trunk: whether its trunk moves.
     """
 
     config: RobotConfig
-    joints: tuple[str, ...]
-    on_ground: bool
-    free_trunk: ClassVar[bool]
+    joints: tuple[str, ...] = robot.JOINTS
+    groups: tuple[tuple[int, ...], ...] = ONE_GROUP
+    base_probe: tuple[float, ...] = ()
+    on_ground: bool = False
+    tolerances: Tolerances = DECLARED
+    free_trunk: ClassVar[bool] = True
 
     @property
     def effort(self) -> tuple[float, ...]:
@@ -98,18 +85,41 @@ class Go1:
         return pd()
 
     def flaws(self, recording: Recording, report: AuditReport) -> list[str]:
-        """Return why a recording cannot be compared, a line each."""
-        return go1_flaws(recording, report, self.joints, free=self.free_trunk)
+        """Return why a recording cannot be compared, a line each; with a free trunk, one of a held trunk can be."""
+        meta, name = recording.meta, recording.meta.episode
+        flaws = []
+        if meta.robot != GO1:
+            flaws.append(f"{name}: is of the robot {meta.robot!r}; the model is of {GO1!r}; {HINT}")
+        if meta.joints != self.joints:
+            flaws.append(f"{name}: has joints {', '.join(meta.joints)}; the model has {', '.join(self.joints)}")
+            return flaws
+        if meta.base != "fixed" and not self.free_trunk:
+            flaws.append(f"{name}: the trunk is free; only robots with a fixed base can be compared")
+        if meta.kp is None or meta.kd is None:
+            flaws.append(f"{name}: says no gains (kp, kd)")
+        flaws += [f"{name}: no {q}" for q in ("q", "qd", "q_target") if not recording.has(q)]
+        if self.free_trunk:
+            flaws += [f"{name}: no {quantity}" for quantity in missing(recording)]
+        # The weight of a standing robot moves joints against their targets; the comparison shows a flipped sign.
+        telling = (*TELLING, "sign") if meta.base == "floating" else TELLING
+        if not flaws:
+            for flaw in report.flaws:
+                needed = flaw.channel in (*NEEDED, "all") or flaw.channel.startswith(("q_", "qd_"))
+                if flaw.verdict == "bad" and needed and flaw.check not in telling:
+                    flaws.append(f"{name}: {flaw.channel}: {flaw.message}")
+        return flaws
 
+    def build(
+        self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False
+    ) -> tuple[Any, ActuatorSetup]:
+        """Return a backend with ``num`` robots, and their drives; a free trunk has no use for ``base_quat``."""
+        model, blocks = self._model(physics_dt, base_quat, mounted)
+        backend = MujocoCpu(model, blocks, num, threads)
+        return backend, actuator_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
 
-NO_SENSORS = 1 << 13
-"""MuJoCo's mjDSBL_SENSOR: the IMU's readings follow from the motion of the base, and those of contacts cost time."""
-
-BASE_PROBE = (5.0e-4, 1.0e-3, 1.0e-3, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01)
-"""Changes of a base's initial height, roll, pitch, velocity and rate by which their influence is measured."""
-
-
-ON_MUJOCO = DECLARED.on(MUJOCO_CONTACT)
+    def _model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool) -> tuple[Any, Any]:
+        """Return the compiled model, and where its sensors are."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -117,36 +127,22 @@ class StandingGo1(Go1):
     """A Go1 that stands or moves on flat ground, its trunk free.
 
     Attributes:
-        config: of the robot.
         held: the same robot with its trunk held, for recordings of it that were made so.
-        joints: names.
-        groups: all joints in one.
-        base_probe: as for :class:`~go1exp.gap.replay.machine.Machine`.
-        on_ground: yes.
         tolerances: of nominal parameters, about the values of this contact.
         contact: of the feet.
-        free_trunk: yes.
     """
 
-    config: RobotConfig
-    held: Machine
-    joints: tuple[str, ...] = robot.JOINTS
-    groups: tuple[tuple[int, ...], ...] = ONE_GROUP
     base_probe: tuple[float, ...] = BASE_PROBE
     on_ground: bool = True
     tolerances: Tolerances = ON_MUJOCO
     contact: ContactConfig = MUJOCO_CONTACT
-    free_trunk: ClassVar[bool] = True
+    held: Machine = field(kw_only=True)
 
-    def build(
-        self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False
-    ) -> tuple[Any, ActuatorSetup]:
-        """Return a backend with ``num`` free robots, and their drives; ``base_quat`` is not used."""
+    def _model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool) -> tuple[Any, Any]:
         ground = build_terrain(TerrainConfig(kind="flat"))
         model, blocks = build_model(self.config, ground, physics_dt, contact=self.contact)
         model.opt.disableflags |= NO_SENSORS
-        backend = MujocoCpu(model, blocks, num, threads)
-        return backend, actuator_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
+        return model, blocks
 
     def suited(self, recordings: Sequence[Recording], phase: Phase = "whole") -> StandingGo1:
         """Return itself: it can be compared with recordings of a held trunk too."""
@@ -167,40 +163,19 @@ class StandingGo1(Go1):
         return StandingReplayer(self, standing, quats, max_rows, threads, held=self.held)
 
 
-IMU_PROBE = (0.1, 0.1, 0.1, 0.02, 0.02, 0.02, 0.0005)
-"""Errors of accelerometer, m/s2, gyro, rad/s, and delay, s, by which the influence of the IMU is measured."""
-
-
 @dataclass(frozen=True)
 class SwingingGo1(Go1):
-    """A Go1 that walks, of which the legs in the air are compared.
+    """A Go1 that walks, of which the legs in the air are compared: nothing that acts on trunk or feet is felt.
 
-    Attributes:
-        config: of the robot.
-        joints: names.
-        groups: all joints in one, since which legs swing changes from window to window.
-        base_probe: errors of the IMU.
-        on_ground: no: what acts on the trunk or on feet is not felt.
-        tolerances: of nominal parameters.
-        free_trunk: yes.
+    All joints are one group, since which legs swing changes from window to window; ``base_probe`` is of the IMU.
     """
 
-    config: RobotConfig
-    joints: tuple[str, ...] = robot.JOINTS
-    groups: tuple[tuple[int, ...], ...] = ONE_GROUP
     base_probe: tuple[float, ...] = IMU_PROBE
-    on_ground: bool = False
-    tolerances: Tolerances = DECLARED
-    free_trunk: ClassVar[bool] = True
 
-    def build(
-        self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False
-    ) -> tuple[Any, ActuatorSetup]:
-        """Return a backend with ``num`` robots in the air on heavy trunks, and their drives."""
+    def _model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool) -> tuple[Any, Any]:
         model, blocks = build_model(self.config, None, physics_dt)
         weigh_down(model, HEAVY)
-        backend = MujocoCpu(model, blocks, num, threads)
-        return backend, actuator_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
+        return model, blocks
 
     def suited(self, recordings: Sequence[Recording], phase: Phase = "swing") -> SwingingGo1:
         """Return itself."""
@@ -219,30 +194,15 @@ class SwingingGo1(Go1):
         return SwingReplayer(self, cast(SwingWindows, windows), quats, max_rows, threads)
 
 
-LEGS = tuple(tuple(range(3 * leg, 3 * leg + 3)) for leg in range(robot.NUM_LEGS))
-
-
 @dataclass(frozen=True)
 class SuspendedGo1(Go1):
     """A Go1 whose trunk is held, so that its legs do not feel each other.
 
     Attributes:
-        config: of the robot.
-        joints: names.
-        groups: the legs.
-        base_probe: none, as the trunk is held.
-        on_ground: no.
-        tolerances: of nominal parameters.
         contact: of its feet where it stands in a recording; None takes the one that recordings name.
-        free_trunk: no.
     """
 
-    config: RobotConfig
-    joints: tuple[str, ...] = robot.JOINTS
     groups: tuple[tuple[int, ...], ...] = LEGS
-    base_probe: tuple[float, ...] = ()
-    on_ground: bool = False
-    tolerances: Tolerances = DECLARED
     contact: ContactConfig | None = None
     free_trunk: ClassVar[bool] = False
 
@@ -256,14 +216,9 @@ class SuspendedGo1(Go1):
         """Lowest and highest angle (J, 2), rad."""
         return robot.JOINT_POS_LIMITS.copy()
 
-    def build(
-        self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False
-    ) -> tuple[Any, ActuatorSetup]:
-        """Return a backend with ``num`` held robots, and their drives."""
+    def _model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool) -> tuple[Any, Any]:
         w, x, y, z = base_quat
-        model, blocks = build_model(self.config, None, physics_dt, held=(w, x, y, z), mounted=mounted)
-        backend = MujocoCpu(model, blocks, num, threads)
-        return backend, actuator_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
+        return build_model(self.config, None, physics_dt, held=(w, x, y, z), mounted=mounted)
 
     def suited(self, recordings: Sequence[Recording], phase: Phase = "whole") -> Robot:
         """Return the standing Go1, or its legs in the air, if its trunk is free in a recording, else this one.
@@ -277,7 +232,7 @@ class SuspendedGo1(Go1):
             return SwingingGo1(self.config, tolerances=self.tolerances)
         contact = contact_of(recordings, self.contact)
         held, known = replace(self, groups=ONE_GROUP), self.tolerances.on(contact)
-        return StandingGo1(self.config, held, tolerances=known, contact=contact)
+        return StandingGo1(self.config, held=held, tolerances=known, contact=contact)
 
     def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
         """Return the recordings as they are."""

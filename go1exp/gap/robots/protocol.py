@@ -26,13 +26,7 @@ class Robot(Machine, Protocol):
         """Return why a recording cannot be compared with this robot, a line each."""
 
     def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
-        """Return recordings without flaws as they are compared, and what had to be chosen.
-
-        Args:
-            recordings: to compare.
-            reports: of their audits.
-            settings: the user's.
-        """
+        """Return recordings without flaws as they are compared, and what had to be chosen."""
 
     def windows(self, ready: Ready) -> Windows:
         """Cut recordings into windows; what is ignored has infinite noise.

@@ -99,14 +99,7 @@ def converged(
 
 
 def _fitted(score: Scorer, rows: Rows, theta: Theta, dt: float) -> Scorer:
-    """Return the scorer on initial states at which each window fits best, in a few Gauss-Newton steps.
-
-    Args:
-        score: on the estimated states, which still count.
-        rows: the plain model on all windows.
-        theta: its values.
-        dt: physics step, s.
-    """
+    """Return the scorer on initial states at which each window fits best, in a few Gauss-Newton steps."""
     everything, machine = np.arange(len(score.windows)), score.replayer.machine
     coordinates = 2 * len(machine.joints) + len(machine.base_probe)
     active, off = everything, np.zeros((len(everything), coordinates))  # off: from the estimates

@@ -19,16 +19,15 @@ from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.rows import MOUNT_LOAD, Machine, Probe, Rows, Theta, mounted, variants
 
 KNEE = 10.0
-"""chi2 per value from which a window counts by its logarithm: 5 % of the windows of a real robot made 35 to 85 % of a
-plain mean, and so decided alone what was named. Up to it the level is the plain mean, to which all limits belong."""
+"""chi2 per value from which a window counts by its logarithm, so that a few windows do not decide alone. Up to it the
+level is the plain mean, to which all limits belong."""
 
 
 def log_chi2(chi2: np.ndarray) -> np.ndarray:
     """Return the logarithm of chi2 per value, below 1 continued by its tangent, so never less than -1.
 
-    A joint that rests in a model with dry friction does not move at all, and chi2 of such a window can be 1e-11. Below
-    the floor there is nothing to be gained, and the logarithm of that would outweigh all else. The slope is
-    1 / max(chi2, 1), the weight that windows have in the fits.
+    A joint that rests in a model with dry friction can have a chi2 of 1e-11, whose logarithm would outweigh all else.
+    The slope is 1 / max(chi2, 1), the weight that windows have in the fits.
     """
     return np.where(chi2 < 1.0, chi2 - 1.0, np.log(np.maximum(chi2, 1.0)))
 

@@ -94,16 +94,15 @@ class Table:
 
 
 ROUGH = 0.5
-"""Share of a column's square by which two measurements of it may differ for that to be errors: a small change of a dead
-band acts or does not, so nearly all of its columns differs, and yet its value is well known."""
+"""Share of a column's square by which two measurements of it may differ for that to be errors: beyond it, it is a
+threshold such as a dead band."""
 
 JUMPS = 0.03
-"""Share of what a window's columns say, in units of tolerances, that may be errors. Beyond it something jumps there,
-such as a stop that is met a step later. Most windows are far below it, and few near it."""
+"""Share of a window's columns, in units of tolerances, that may be errors. Beyond it something jumps there, such as a
+stop that is met a step later."""
 
 KEPT = 0.2
-"""Share of what a column says that windows without jumps must hold for those with jumps to be left out: what a stop
-does is seen nowhere else."""
+"""Share of a column's signal that windows without jumps must hold for those with jumps to be left out."""
 
 
 def unbiased_grams(scorer: Scorer, one: Table, other: Table, unit: np.ndarray, needed: np.ndarray) -> np.ndarray:
@@ -171,16 +170,7 @@ def table(scorer: Scorer, theta: Theta, windows: np.ndarray, probes: Sequence[Pr
 
 
 def borrowed(known: Table, scorer: Scorer, theta: Theta, probes: Sequence[Probe], fresh: set[Key], dt: float) -> Table:
-    """Return a linear model about other values whose columns are those of ``known``, but for some that are measured.
-
-    Args:
-        known: of the same windows, about values that are not far; perhaps in units of another noise.
-        scorer: that counts.
-        theta: the values.
-        probes: all columns.
-        fresh: parameters whose columns are measured; those that ``known`` has not among them.
-        dt: physics step, s.
-    """
+    """Return a linear model about other values whose columns are those of ``known``, but for some that are measured."""
     measured = table(scorer, theta, known.windows, [p for p in probes if p.key in fresh], dt)
     one = np.ones_like(measured.scale)
     ratio = np.divide(known.scale, measured.scale, out=one, where=np.isfinite(measured.scale))[:, None]

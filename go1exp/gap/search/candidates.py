@@ -87,17 +87,7 @@ def candidate(model: Model, joints: Sequence[str], **tested: object) -> Candidat
 def absorbed(
     search_keys: Sequence[Key], relief: Mapping[str, float], theta: Theta, tolerances: Tolerances, most: int
 ) -> list[Candidate]:
-    """Return, for a gap that the tolerances close, the effects that would rather leave theirs, strongest first.
-
-    None of them is claimed: all that the data ask for lies within what the model may be wrong by anyway.
-
-    Args:
-        search_keys: parameters of the box.
-        relief: effect -> fall of chi2 and priors if it may.
-        theta: fitted values within the tolerances.
-        tolerances: these.
-        most: rows.
-    """
+    """Return, for a gap that the tolerances close, the effects that would rather leave theirs, strongest first."""
     order = sorted((e for e in relief if relief[e] > thresholds.LISTED_RELIEF), key=lambda e: -relief[e])
     return [
         Candidate(

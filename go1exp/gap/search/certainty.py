@@ -91,8 +91,7 @@ def _grams(state: State, linear: Table) -> np.ndarray:
 def opposite(state: State, probes: Sequence[Probe]) -> list[Probe]:
     """Return other changes of the same parameters: the other way, or half as far where a bound is in the way.
 
-    Shapes (a place, a phase) have no tolerance and are changed by much more. Two such changes differ because what they
-    do is curved, which is no error: their changes stay as they are.
+    Shapes (a location, a phase) have no tolerance; their changes stay: two of them differ by curvature.
     """
     turned = []
     for probe in probes:
@@ -108,7 +107,7 @@ def opposite(state: State, probes: Sequence[Probe]) -> list[Probe]:
 def semidefinite(matrix: np.ndarray) -> np.ndarray:
     """Return a symmetric matrix (n, n) without its negative eigenvalues, taken with a diagonal of ones.
 
-    What errors add is taken away on average only, so that along what the data do not tell less than nothing may remain.
+    Errors are subtracted on average only, so along unidentifiable directions the matrix can be indefinite.
     """
     scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
     inverse = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
@@ -118,14 +117,7 @@ def semidefinite(matrix: np.ndarray) -> np.ndarray:
 
 
 def on_bound(search: Search, effect: str, theta: Theta, joints: Sequence[str]) -> str:
-    """Return which value of a term lies on the bound of its parameter, in words; empty if none does.
-
-    Args:
-        search: that found it.
-        effect: the term.
-        theta: fitted values.
-        joints: where it is named; empty for an effect of the whole robot.
-    """
+    """Return which value of a term lies on the bound of its parameter, in words; empty if none does."""
     everyone = search.state.scorer.windows.joints
     for key in sizes(effect):
         p = search.state.tolerances.param(key)
@@ -142,16 +134,7 @@ def on_bound(search: Search, effect: str, theta: Theta, joints: Sequence[str]) -
 
 
 def doubt(search: Search, effect: str, theta: Theta, joints: Sequence[str], adequate: bool, check: LastCheck) -> str:
-    """Return why a term is not certified; empty if it is.
-
-    Args:
-        search: that found it.
-        effect: the term.
-        theta: fitted values.
-        joints: where it is named.
-        adequate: whether the model with all terms counts as right.
-        check: what the terms do on the last check.
-    """
+    """Return why a term is not certified; empty if it is."""
     stable, alone = search.shares.get(effect, 0.0), search.removes(effect)
     rivals = [name for name in search.aliases.get(effect, ()) if name != effect]
     if not check.helps:
@@ -176,12 +159,7 @@ def doubt(search: Search, effect: str, theta: Theta, joints: Sequence[str], adeq
 
 
 def beside_a_gap(search: Search, effect: str) -> float:
-    """Return the relative half width that what remains adds to the 95 % intervals of a term's values.
-
-    Args:
-        search: that accepted the term, and whose model leaves a gap.
-        effect: the term.
-    """
+    """Return the relative half width that what remains adds to the 95 % intervals of a term's values."""
     goes = search.removes(effect)
     if math.isnan(goes):
         goes = removed(search.first, excess(search.select_chi2))
@@ -191,14 +169,6 @@ def beside_a_gap(search: Search, effect: str) -> float:
 def widened(
     value: np.ndarray, low: np.ndarray, high: np.ndarray, null: float, share: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return intervals (low, high) of values, wider by a share of what each is off null; independent errors add up.
-
-    Args:
-        value: fitted.
-        low: ends of their intervals, of the same shape.
-        high: the same.
-        null: of the parameter.
-        share: half width, relative.
-    """
+    """Return intervals (low, high) of values, wider by a share of what each is off null; independent errors add up."""
     bias = share * np.abs(value - null)
     return value - np.hypot(value - low, bias), value + np.hypot(high - value, bias)

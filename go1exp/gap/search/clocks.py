@@ -97,12 +97,6 @@ def same_rows(
     Noise is the smaller of what is seen by the clocks, since a wrong one makes motion look like noise. The first states
     are as uncertain as by the clock that knows them less.
 
-    Args:
-        recordings: by each clock.
-        cuts: how to cut them by that clock.
-        settings: lengths of windows.
-        spared: rows (T,) bool of each recording that no window may have.
-
     Raises:
         RecordingError: if not one window fits by all clocks.
     """
@@ -181,12 +175,6 @@ def contest(
     A clock is taken if the sign-flip test over stretches of neighbouring windows is significant (``settings.alpha``),
     the mean of log chi2 differs by more than what means the same (``SAME_GAIN``), and the model without terms
     does not significantly want the other one. Otherwise it is not decided, and the default is taken.
-
-    Args:
-        sides: the windows by the clocks ``recorded`` and ``speeds``, of the same rows.
-        parts: the two halves, ``train`` and ``select``, which take turns.
-        settings: of the search.
-        on_progress: called with what is being done, and which share of the work is finished.
     """
     asked = dataclasses.replace(settings, max_terms=min(thresholds.CLOCK_TERMS, settings.max_terms), bootstraps=0)
     halves = (parts, dataclasses.replace(parts, train=parts.select, select=parts.train))

@@ -95,15 +95,7 @@ def fit(scorer: Scorer, models: Sequence[Model], common: Table, iterations: int,
 
 
 def descend(scorer: Scorer, model: Model, linear: Table, steps: int, dt: float) -> Model:
-    """Fit one model by columns that learn from each step (Broyden's method), as long as steps gain something.
-
-    Args:
-        scorer: of the windows.
-        model: begins where ``linear`` was measured.
-        linear: all columns that may move.
-        steps: at most.
-        dt: physics step of the residuals, s.
-    """
+    """Fit one model by columns that learn from each step (Broyden's method), as long as steps gain something."""
     layout, known = Layout.from_probes(scorer.replayer.machine, linear.probes), model.may.tolerances
     reached = float(log_chi2(scorer.chi2(linear.residual, linear.windows)).mean())
     for turn in range(steps):

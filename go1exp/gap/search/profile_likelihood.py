@@ -4,6 +4,9 @@ Initial states that were moved to suit the nominal model hide a part of what is 
 at those states stops early: a payload of 2 kg on a walk comes out as 1 kg, and the truth looks worse than nothing. So
 for every value the windows begin at the states that sensors measure, which are then moved to suit that value alone.
 Where feet stick, derivatives say little. So values on a ladder are tried, and then values between the best rungs.
+
+In all functions ``score`` is what :func:`begun` returns, ``windows`` (V,) are the numbers of those that count, and
+``dt`` is the physics step, s.
 """
 
 from __future__ import annotations
@@ -24,12 +27,7 @@ from go1exp.sim.effects.tolerances import declared
 
 
 def begun(score: Scorer, dt: float) -> Scorer:
-    """Return a scorer with the same floors whose initial states are those that sensors tell.
-
-    Args:
-        score: of a standing robot (``initial_state.converged``), of the nominal model.
-        dt: physics step, s.
-    """
+    """Return a scorer with the same floors whose initial states are those that sensors tell."""
     assert score.expected is not None
     replayer = dataclasses.replace(score.replayer, windows=score.expected)
     return scorer(replayer, {}, score.scale, dt, score.clock_s)
@@ -39,12 +37,6 @@ def chi2(score: Scorer, theta: Theta, windows: np.ndarray, dt: float) -> np.ndar
     """Return chi2 per value (V, 1) of a model, each window's initial state moved to suit it.
 
     What the states are away from what sensors tell counts as much as readings do.
-
-    Args:
-        score: what :func:`begun` returns.
-        theta: values of the model.
-        windows: (V,) which.
-        dt: physics step, s.
     """
     w = score.windows
     joints, coordinates = len(w.joints), 2 * len(w.joints) + w.base_sd.shape[1]
@@ -82,13 +74,6 @@ def fitted(
 ) -> tuple[Theta, float]:
     """Return the values of an effect that fit best, one number for each parameter, one parameter after the other.
 
-    Args:
-        score: what :func:`begun` returns.
-        keys: the parameters; one that is best at its null value is not among those returned.
-        windows: (V,) to fit.
-        dt: physics step, s.
-        nominal: cost of the nominal model, if it is known.
-
     Returns:
         The values and their cost.
     """
@@ -120,15 +105,7 @@ def _along(score: Scorer, key: Key, others: Theta, windows: np.ndarray, dt: floa
 
 
 def within_tolerances(score: Scorer, begin: Theta, keys: Sequence[Key], windows: np.ndarray, dt: float) -> Theta:
-    """Return the values within their tolerances that fit best, alike at all joints, one parameter after the other.
-
-    Args:
-        score: what :func:`begun` returns.
-        begin: values to begin at, as far as tolerances let them.
-        keys: the parameters.
-        windows: (V,) to fit.
-        dt: physics step, s.
-    """
+    """Return the values within their tolerances that fit best, alike at all joints, one parameter after the other."""
     limits = {key: _limits(score, key) for key in keys}
     theta = {key: value.clip(*limits[key]) for key, value in begin.items() if key in limits}
     least = cost(score, theta, windows, dt)
@@ -148,14 +125,6 @@ def at_one_part(
 
     All of them at one end of their tolerances come first, since several that are off a little together are what none
     of them shows by itself; of the best part and end each is then fitted.
-
-    Args:
-        score: what :func:`begun` returns.
-        begin: values within their tolerances.
-        keys: parameters of the joints.
-        parts: the joints of each.
-        windows: (V,) to fit.
-        dt: physics step, s.
     """
     theta, least, better = begin, cost(score, begin, windows, dt), frozenset[int]()
     for part in parts:

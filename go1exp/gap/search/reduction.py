@@ -82,12 +82,6 @@ def chosen(linear: Linear, name: str, kept: frozenset[tuple[str, int]], rng: np.
 
     Sets of joints are added as long as each joint gains more than ``JOINT_GAIN``. Then joints are taken away that bring
     too little, or that held-out windows do not miss.
-
-    Args:
-        linear: of the model with the term.
-        name: of the term.
-        kept: effects and joints that stay within tolerance already.
-        rng: of the tests.
     """
     joints, known = linear.machine.joints, linear.may.tolerances
     outside = frozenset(int(j) for j in np.flatnonzero(candidates.beyond(name, linear.theta, joints, known)))
@@ -126,13 +120,8 @@ def chosen(linear: Linear, name: str, kept: frozenset[tuple[str, int]], rng: np.
 def fewer(linear: Linear, name: str, kept: frozenset[tuple[str, int]]) -> list[frozenset[int]]:
     """Return smaller sets of joints that a term might be at alone, to be fitted: the fewest joints first.
 
-    About values that are spread over joints the linear model cannot tell what one of them would do alone: a thigh of
-    0.74 of its mass was 0.83, with two hips of 1.8 and 1.4. Left out are sets that lose most of what the term brings.
-
-    Args:
-        linear: of the model with the term.
-        name: of the term.
-        kept: effects and joints that stay within tolerance already.
+    About values that are spread over joints the linear model does not predict what one of them would do alone. Sets
+    that lose most of the term's gain are left out.
     """
     joints, known = linear.machine.joints, linear.may.tolerances
     outside = frozenset(int(j) for j in np.flatnonzero(candidates.beyond(name, linear.theta, joints, known)))
@@ -245,12 +234,7 @@ def concentrate(search: Search, name: str) -> Search:
 
 
 def keep_within(search: Search, kept: frozenset[tuple[str, int]]) -> Search | None:
-    """Return the search with terms within tolerance at some joints; None if held-out windows miss them there.
-
-    Args:
-        search: the present one.
-        kept: effects and joints, those that are kept already among them.
-    """
+    """Return the search with terms within tolerance at some joints; None if held-out windows miss them there."""
     sparse = search.state.keeping(kept).converged(2)
     chi2 = sparse.held_out()
     if significance.gains(search.select_chi2, chi2[None]).mean() < -thresholds.SAME_GAIN:
@@ -281,7 +265,7 @@ def symmetrical(search: Search) -> Search:
 def still_equal(search: Search, name: str, instead: str, rest: State) -> tuple[str, ...]:
     """Return which equals of a term do as well as the one that is to take its place (``rest``, fitted).
 
-    They were equals of the term, which says nothing of another: each is fitted in its place.
+    Each is fitted in the place of the term.
     """
     others = [n for n in search.aliases.get(name, ()) if n != instead and n not in search.state.terms]
     if not others:
@@ -296,8 +280,7 @@ def still_equal(search: Search, name: str, instead: str, rest: State) -> tuple[s
 def instead_of(state: State, name: str) -> State:
     """Return the state with the simpler effect in the place of a term, not fitted.
 
-    It begins half-way between two parameters of the term that are equal where it is that effect: friction that is the
-    same both ways is far from the tolerance at which plain friction was left.
+    It begins half-way between two parameters of the term that are equal where it is that effect.
     """
     how = tolerances.identification(name)
     rest = state.without(name, how.simpler)

@@ -195,16 +195,7 @@ def screen(
     library: Sequence[Variant],
     dt: float,
 ) -> list[Screened]:
-    """Rank variants.
-
-    Args:
-        scorer: of the windows.
-        theta: present values.
-        present: the linear model of what may move already.
-        may: what may leave its tolerance.
-        library: the variants.
-        dt: physics step, s.
-    """
+    """Rank variants by a linear model that adds their columns to those of ``present``, about the values ``theta``."""
     every = [p for v in library for p in v.probes]
     columns = _columns(scorer, theta, present.windows, every, dt)
     whole = np.concatenate([present.columns, columns], axis=-1)
@@ -259,10 +250,6 @@ def outside(screened: Sequence[Screened], within: Collection[str]) -> list[Scree
     """Return the effects to try if one that has no tolerance to move in would relieve the others most; none otherwise.
 
     Those that would relieve nearly as much are its rivals; held-out data decide between them.
-
-    Args:
-        screened: what the linear model says of every effect.
-        within: effects that move within their tolerances already.
     """
     order = sorted(screened, key=lambda s: -s.relief)
     if not order or order[0].variant.effect in within or order[0].relief < thresholds.OUTSIDE_BOX:
@@ -275,11 +262,6 @@ def rivals(screened: Sequence[Screened], active: Collection[str], within: Collec
 
     Only effects without a tolerance, since the bounds of all others would be active too, that would relieve the model
     nearly as much as the first active one; of each the variant that would do so most.
-
-    Args:
-        screened: what the linear model says of every effect.
-        active: effects that would leave their tolerance.
-        within: effects that move within their tolerances already.
     """
     most = max((s.relief for s in screened if s.variant.effect in active), default=0.0)
     best: dict[str, Screened] = {}
@@ -295,7 +277,7 @@ def _start(
 ) -> Theta:
     """Return where a fit begins: the present values with the variant's effect alone moved.
 
-    What else the linear model would move, it would move too far: with the effect so large, it is no longer right.
+    The linear model would move all else too far.
     """
     if variant.probes:
         extra = Layout.from_probes(machine, variant.probes)

@@ -10,13 +10,9 @@ from go1exp.gap.search import thresholds
 
 
 def gains(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return the fall of log chi2 (M, V G) of models in every window and group of joints.
+    """Return the fall of log chi2 (M, V G) of models (M, V, G) in every window and group of joints.
 
     Groups do not feel each other, so each is a sample of its own; an effect that few windows show needs them all.
-
-    Args:
-        before: chi2 per value (V, G).
-        after: the same of each model (M, V, G).
     """
     return np.asarray(log_chi2(before) - log_chi2(after)).reshape(len(after), -1)
 
@@ -49,14 +45,7 @@ def max_t(
 
 
 def shown(p: np.ndarray, share: np.ndarray, before: float, settings: GapSettings) -> np.ndarray:
-    """Return which models (M,) held-out windows show to be better.
-
-    Args:
-        p: p-value (M,) of each model's gain.
-        share: of the excess that is gone (M,).
-        before: excess of the model with which they are compared.
-        settings: significance, and the excess that is a gap.
-    """
+    """Return which models (M,) held-out windows show to be better."""
     large = (share >= thresholds.LARGE_SHARE) & (before > settings.material)
     return np.asarray((p < settings.alpha) | (large & (p < thresholds.LARGE_ALPHA * settings.alpha)))
 

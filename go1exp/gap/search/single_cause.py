@@ -47,12 +47,7 @@ def differ(values: np.ndarray, drawn: np.ndarray, tolerance: float) -> bool:
 
 
 def may_be(model: Model, state: State) -> bool:
-    """Return whether each parameter of a cause may be the same at all joints, to one tolerance.
-
-    Args:
-        model: fitted joint by joint.
-        state: whose initial states suit it.
-    """
+    """Return whether each parameter of a cause may be the same at all joints, to one tolerance."""
     known = model.may.tolerances
     parameters = [key for key in model.keys if key in model.theta and model.theta[key].size > 1]
     if all(np.ptp(model.theta[key]) <= known.param(key).tolerance for key in parameters):
@@ -112,10 +107,6 @@ class Sought:
 def clearest(begun: Scorer, state: State) -> Sought:
     """Return the effect of the whole robot, or alike at all joints, that does best by initial states of its own.
 
-    Args:
-        begun: scores from the initial states that sensors tell (``profile_likelihood.py``).
-        state: of the search, whose windows count.
-
     Returns:
         No cause unless, on windows that no fit has seen, it does clearly better than all others and nothing at all; one
         of the joints also better than joints that are all off alike within their tolerances.
@@ -148,8 +139,7 @@ def clearest(begun: Scorer, state: State) -> Sought:
 def _off_alike(begun: Scorer, best: Theta, windows: np.ndarray, dt: float) -> Theta:
     """Return what does most of what ``best`` does within tolerances: it, drives and legs, off alike.
 
-    Alike at all joints, and then the drives of one part: hips of 85 %, whose 0.95 of strength and 0.9 of both gains are
-    within their tolerances, were named as offsets of the calves' encoders.
+    Alike at all joints, and then the actuators of one part.
     """
     known = members("effect")
     effects = [
@@ -171,12 +161,7 @@ Test = Callable[[Search, Sequence[Model], State, np.ndarray, np.ndarray], tuple[
 def cause(search: Search, test: Test) -> tuple[Search, Sought]:
     """Return the effect of the whole robot, or alike at all joints, that explains nearly everything by itself, if any.
 
-    Initial states that suit the nominal model hide a part of what is missing. So effects are compared by initial states
-    of their own, and the best is fitted again at states that suit it.
-
-    Args:
-        search: that has not begun.
-        test: tests the best effect.
+    Effects are compared by initial states of their own, and the best is fitted again at states that suit it.
 
     Returns:
         The search, whose evidence has the best effect if it was tested, and that effect.
@@ -200,15 +185,7 @@ def cause(search: Search, test: Test) -> tuple[Search, Sought]:
 def _confirmed(
     best: Model, search: Search, test: Test, plain: np.ndarray, now: np.ndarray
 ) -> tuple[Search, Model | None]:
-    """Return the clearest cause fitted joint by joint at states that suit it, if it still is the one cause.
-
-    Args:
-        best: the cause.
-        search: that has not begun.
-        test: tests it.
-        plain: (V, G) chi2 of the nominal model on the windows of the fit.
-        now: the same on held-out windows.
-    """
+    """Return the clearest cause fitted joint by joint at states that suit it, if it still is the one cause."""
     state = search.state
     if state.settings.effects and best.name not in state.settings.effects:
         return search, None

@@ -94,12 +94,10 @@ class State:
         return Model("", theta, self.may, ())
 
     def converged(self, rounds: int, rival: State | None = None) -> State:
-        """Return the state with all that may move fitted on the windows for training.
+        """Return the state with all that may move fitted on the windows for training, in at most so many ``rounds``.
 
-        Args:
-            rounds: of measuring the linear model and fitting by it, at most.
-            rival: whose fit is to be reached: once a round that gains as much as the last would not come there, no more
-                are made.
+        A round measures the linear model and fits by it. No more are made once a round that gains as much as the last
+        would not reach the fit of ``rival``.
         """
         worst = math.inf if rival is None else float(log_chi2(rival.train_chi2).mean())
         state, nearby = self, self._nearby() if rounds > 1 else None

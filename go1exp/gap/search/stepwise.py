@@ -163,12 +163,7 @@ def noting_signals(search: Search, screened: Sequence[Screened]) -> Search:
 
 
 def at_active_bounds(search: Search, screened: Sequence[Screened]) -> tuple[Search, list[Model]]:
-    """Return fitted candidates where the tolerances close the gap: none without an active bound.
-
-    Args:
-        search: whose evidence lists the effects of bounds that are not active enough.
-        screened: what screening says of every effect; it is done here if it is empty, and needed.
-    """
+    """Return fitted candidates where the tolerances close the gap: none without an active bound."""
     state = search.state
     within = tolerances.nominal(state.machine)
     relief = tolerances.relief(state.scorer, state.table, state.may)
@@ -200,14 +195,7 @@ def freed(search: Search, effect: str) -> Model:
 def refitted(state: State, effect: str, theta: Theta, rounds: int = 2) -> Model:
     """Return the model in which an effect may leave its tolerance, and the others begin at their nominal values.
 
-    Several effects within their tolerances make up for it together, at next to no cost: from there a fit of few
-    steps hardly comes away.
-
-    Args:
-        state: the present model.
-        effect: the candidate.
-        theta: values of which those of the candidate and of the terms are kept.
-        rounds: of fitting, at most.
+    From several effects that make up for it within their tolerances, a fit of few steps hardly comes away.
     """
     terms = (*state.terms, effect)
     kept = {key: value for key, value in theta.items() if key[0] in (*terms, *state.relaxed)}
@@ -218,9 +206,8 @@ def refitted(state: State, effect: str, theta: Theta, rounds: int = 2) -> Model:
 def fitted_candidates(search: Search, screened: Sequence[Screened]) -> list[Model]:
     """Return models of the best candidates, fitted.
 
-    They start from the linear model of a few windows, and what looks hopeless after a step is given up. Where the model
-    is near the data, effects of the tolerance box are also fitted each on its own, and the better fit counts. An effect
-    that is easily taken for the best candidate is refitted from nominal values of all else, too.
+    Where the model is near the data, effects of the tolerance box are also fitted each on its own, and the better fit
+    counts. An effect that is easily taken for the best candidate is refitted from nominal values of all else, too.
     """
     state, settings = search.state, search.settings
     chosen: dict[str, Screened] = {}
@@ -242,10 +229,7 @@ def fitted_candidates(search: Search, screened: Sequence[Screened]) -> list[Mode
 
 
 def fitted_on(search: Search, fitted: Sequence[Model]) -> list[Model]:
-    """Return candidates, of which those that leave next to nothing are fitted on, if there are several.
-
-    They may do equally well, and one whose fit ended a little early would be called worse than the others.
-    """
+    """Return candidates, of which those that leave next to nothing are fitted on, if there are several."""
     near = [m for m in fitted if m.chi2 is not None and excess(m.chi2) <= search.settings.adequate]
     if len(near) < 2:
         return [*fitted]
@@ -265,15 +249,9 @@ def held_out_test(
     select: np.ndarray,
     small: bool = False,
 ) -> tuple[Search, Model | None, Model | None]:
-    """Test fitted candidates on held-out windows.
+    """Test fitted candidates on held-out windows, by the chi2 (V, G) of the present model there and in the fit.
 
-    Args:
-        search: whose evidence takes the candidates.
-        fitted: the candidates.
-        state: with the scorer that counts.
-        train: (V, G) chi2 of the present model on the windows of the fit.
-        select: the same on held-out windows.
-        small: whether the gap is small, so that which share of it a candidate removes means nothing.
+    Where the gap is ``small``, the share of it that a candidate removes has no meaning.
 
     Returns:
         The search, the candidate to accept, and the best of those that help within their tolerances.

@@ -125,10 +125,7 @@ class Freedom:
 
 
 def _beyond_tolerance(effect: str, theta: Mapping[Key, np.ndarray], joint: int, tolerances: Tolerances) -> bool:
-    """Return whether an effect leaves its tolerance at a joint: where it does not, its shape hardly matters.
-
-    A place of next to no mass would wander through all of its bounds, and take the length of every step with it.
-    """
+    """Return whether an effect leaves its tolerance at a joint: where it does not, its shape hardly matters."""
     for key in sizes(effect):
         p = tolerances.param(key)
         value = np.ravel(theta.get(key, np.array([p.null])))
@@ -280,13 +277,7 @@ def relief(scorer: Scorer, linear: Table, may: Freedom) -> dict[str, float]:
 
 
 def active_bounds(relieved: Mapping[str, float], count: float, but: Collection[str]) -> list[str]:
-    """Return the effects that would leave their tolerance if they might, the one that gains most first.
-
-    Args:
-        relieved: what :func:`relief` found.
-        count: of values that were compared.
-        but: effects that are out of the question.
-    """
+    """Return the effects that would leave their tolerance, largest gain first; ``count`` values were compared."""
     order = sorted((e for e in relieved if e not in but), key=lambda e: -relieved[e])
     return [
         e

@@ -270,8 +270,9 @@ def prove(
         if comparison.robot.on_ground:
             _same_contact(comparison.robot.tolerances, tolerances_of(result))
         windows = _windows(comparison, result)
-        values = _proposals(contents, robot)
-        plain, effect_only, both = (excess(_held_out(comparison, theta, windows)) for theta in values)
+        calibration, missing = contents.get(CALIBRATION, {}), contents.get(EFFECT, {})
+        files = (theta_of(terms_of(c), robot.joints) for c in (missing, composed(calibration, missing)))
+        plain, effect_only, both = (excess(_held_out(comparison, theta, windows)) for theta in ({}, *files))
     reported = _reported(result)
     holds = both <= max(settings.adequate, min(plain, 1.5 * reported + 0.1))
     closed = removed(plain, both)
@@ -288,7 +289,11 @@ def read_as(robot: Robot, result: GapResult) -> Robot:
         if robot.contact is not None:
             _same_contact(Tolerances(contact=robot.contact), tolerances_of(result))
         return replace(robot, contact=result.contact)
-    return _by_clock(robot, result)
+    clock = robot.config.clock if isinstance(robot, FixedBase) else None
+    if (clock == "compare") == (result.clock is not None):
+        return robot.by_clock(result.clock.taken) if isinstance(robot, FixedBase) and result.clock else robot
+    before = "compare" if result.clock else "another one"
+    raise GapFileError(f"model.clock = {clock}: {before} in the search that found this; run go1exp gap explain again")
 
 
 def _same_contact(now: Tolerances, searched: Tolerances) -> None:
@@ -298,26 +303,6 @@ def _same_contact(now: Tolerances, searched: Tolerances) -> None:
         raise GapFileError(
             f"contact: {texts[0]}; {texts[1]} in the search that found this; run go1exp gap explain again"
         )
-
-
-def _by_clock(robot: Robot, result: GapResult) -> Robot:
-    """Return the robot whose recordings are read by the clock that a result was found by.
-
-    Raises:
-        GapFileError: if the model says now what the search was to compare, or the other way round.
-    """
-    clock = robot.config.clock if isinstance(robot, FixedBase) else None
-    if (clock == "compare") == (result.clock is not None):
-        return robot.by_clock(result.clock.taken) if isinstance(robot, FixedBase) and result.clock else robot
-    before = "compare" if result.clock else "another one"
-    raise GapFileError(f"model.clock = {clock}: {before} in the search that found this; run go1exp gap explain again")
-
-
-def _proposals(contents: Mapping[str, Mapping[str, Any]], robot: Robot) -> tuple[Theta, Theta, Theta]:
-    """Return the values of the plain model, with ``effect.yaml``, and with ``calibration.yaml`` as well."""
-    calibration, missing = contents.get(CALIBRATION, {}), contents.get(EFFECT, {})
-    effect, both = (theta_of(terms_of(c), robot.joints) for c in (missing, composed(calibration, missing)))
-    return {}, effect, both
 
 
 def _windows(comparison: Comparison, result: GapResult) -> np.ndarray:

@@ -74,15 +74,7 @@ def check(
     on_progress: Progress = lambda what, share: None,
     screen: bool = True,
 ) -> CheckResult:
-    """Take a first look at recordings of a robot.
-
-    Args:
-        recordings: of one robot.
-        robot: the nominal Go1, or another one.
-        settings: how they are cut.
-        on_progress: called with what is being done, and which share of the work is finished.
-        screen: whether to ask also which effects the recordings could not show.
-    """
+    """Take a first look at recordings of a robot."""
     robot = robot_from(robot)
     with one_thread():
         try:

@@ -132,7 +132,7 @@ def pairs_of(result: GapResult, robot: Robot) -> list[Pair]:
     """
     if result.verdict in ("bad log", "unexplained"):
         raise DesignError(
-            f"the result is {result.verdict!r}: it names nothing that could be distinguished from something else; "
+            f"the result is {result.verdict!r}: it names no effect to distinguish from others; "
             "mend the logs, or record more kinds of motion"
         )
     theta = model_of(result, robot)
@@ -280,23 +280,13 @@ def _left(
     for pair in pairs:
         evaluator = Evaluator(pair, comparison.scorer, comparison.settings, COARSE * comparison.dt)
         worth = evaluator.worth(evaluator.at_hand)
-        if worth.power < ENOUGH or _equal(pair, result):
+        equal = any(n.effect == pair.truth and pair.rival in n.alias_set for n in result.named)  # in the search
+        if worth.power < ENOUGH or equal:
             evaluators.append(evaluator)
             before.append(worth)
         else:
-            distinguishable.append(_shown(pair, worth))
+            distinguishable.append(f"{pair.name} (power {worth.power:.0%})")
     return evaluators, before
-
-
-def _shown(pair: Pair, worth: Worth) -> str:
-    """Say in words how surely recordings tell a pair apart; what shows in no window alone may in all of them."""
-    alone = "" if pair.rival else f" (twice the tolerance of {pair.truth} shows in no window alone, in all together)"
-    return f"{pair.name}: {worth.power:.0%}{alone}"
-
-
-def _equal(pair: Pair, result: GapResult) -> bool:
-    """Return whether the search itself took the two for equals."""
-    return any(n.effect == pair.truth and pair.rival in n.alias_set for n in result.named)
 
 
 def _verdicts(

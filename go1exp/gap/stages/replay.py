@@ -29,6 +29,7 @@ from go1exp.robot.config import RobotConfig
 
 UNITS = {"q": "rad", "qd": "rad/s", "tau_est": "N m"}
 TURN, SPEED = ("roll", "pitch", "yaw"), ("base_lin_vel_x_b", "base_lin_vel_y_b", "base_lin_vel_z_b")
+TRUNK_CHANNELS = {"imu_gyro": AXES[:3], "imu_acc": AXES[3:], "attitude": TURN, "base_lin_vel": SPEED}
 TRUNK_UNITS = {"imu_gyro": "rad/s", "imu_acc": "m/s2", "attitude": "rad", "base_lin_vel": "m/s"}
 WORST = 3
 """Windows that are named as the worst."""
@@ -82,7 +83,7 @@ class Part:
         lines.append(f"  {'all':10}" + "".join(f"{self.quantity(name):16.4g}" for name in kinds))
         typical = [np.median([noise[c] for c in joint_channels(name, self.joints)]) for name in kinds]
         lines.append(f"  {'noise':10}" + "".join(f"{value:16.4g}" for value in typical))
-        for name, columns in _trunk_columns().items():
+        for name, columns in TRUNK_CHANNELS.items():
             if columns[0] in total:
                 known = np.array([noise[c] for c in columns])
                 of_it = f"; noise {np.median(known):.2g}" if np.isfinite(known).all() else ""
@@ -139,10 +140,6 @@ class ReplayResult:
             "flaws": list(self.flaws),
             "parts": parts,
         }
-
-
-def _trunk_columns() -> dict[str, tuple[str, ...]]:
-    return {"imu_gyro": AXES[:3], "imu_acc": AXES[3:], "attitude": TURN, "base_lin_vel": SPEED}
 
 
 def replay(
