@@ -13,7 +13,7 @@ import numpy as np
 
 from go1exp import __version__
 from go1exp.gap.actuator_net.dataset import JointTorque, Rows, Split, fingerprint, split, windows
-from go1exp.gap.actuator_net.report import Reference, Report, command, linear, pd, report, rmse, thresholds
+from go1exp.gap.actuator_net.report import Reference, Report, linear, recorded, report, rmse, thresholds
 from go1exp.gap.actuator_net.settings import FitError, FitSettings
 from go1exp.gap.actuator_net.train import Trained, train
 from go1exp.logs.recording import Recording
@@ -168,8 +168,7 @@ def _references(
     """Return what the net is compared with, on the held-out rows."""
     training, held_out = shares["train"], shares["held_out"]
     references = [
-        command(held_out.rows),
-        pd(held_out.rows),
+        *recorded(held_out.rows),
         linear(training.rows, training.group, held_out.rows, held_out.group),
     ]
     if not settings.half_net:

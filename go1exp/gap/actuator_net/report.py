@@ -68,17 +68,11 @@ def masks(rows: Rows, limits: list[Thresholds]) -> dict[str, np.ndarray]:
 
 def as_text(limits: list[Thresholds]) -> list[str]:
     """Return one line per joint with its limits."""
-    lines = []
-    for x in limits:
-        values = asdict(x)
-        description = "speed unknown: no still, slow, fast or reversal"
-        if x.still_below is not None:
-            description = (
-                "still below {still_below:.3g} rad/s, fast from {fast_above:.3g} rad/s, "
-                "reversal within {reversal_within:g} s of a sign change"
-            ).format(**values)
-        lines.append(f"{x.joint}: {description}; high torque above {x.high_torque_above:.3g} N m")
-    return lines
+    speeds = "still below {still_below:.3g} rad/s, fast from {fast_above:.3g} rad/s, reversal within "
+    speeds += "{reversal_within:g} s of a sign change"
+    unknown = "speed unknown: no still, slow, fast or reversal"
+    text = "{joint}: %s; high torque above {high_torque_above:.3g} N m"
+    return [(text % (unknown if x.still_below is None else speeds)).format(**asdict(x)) for x in limits]
 
 
 NAMES = {
@@ -98,18 +92,14 @@ class Reference:
     reason: str = ""
 
 
-def command(rows: Rows) -> Reference:
-    """Predict the commanded torque; kp e if targets were commanded."""
-    if np.isnan(rows.command).any():
-        return Reference("command", None, "no tau_cmd, and no q_target with known kp")
-    return Reference("command", rows.command)
-
-
-def pd(rows: Rows) -> Reference:
-    """Predict the torque of the firmware's PD law."""
-    if np.isnan(rows.pd).any():
-        return Reference("pd", None, "kp and kd, or q_target and qd, are not in all recordings")
-    return Reference("pd", rows.pd)
+def recorded(rows: Rows) -> list[Reference]:
+    """Return the commanded torque (kp e if targets were commanded), and the torque of the firmware's PD law."""
+    without = {
+        "command": "no tau_cmd, and no q_target with known kp",
+        "pd": "kp and kd, or q_target and qd, are not in all recordings",
+    }
+    torque = {name: getattr(rows, name) for name in without}
+    return [Reference(n, None, without[n]) if np.isnan(v).any() else Reference(n, v) for n, v in torque.items()]
 
 
 def linear(train: Rows, train_group: np.ndarray, rows: Rows, group: np.ndarray) -> Reference:

@@ -112,8 +112,8 @@ def _changes(t: np.ndarray, values: np.ndarray, lo: float, hi: float) -> tuple[n
 def bridged(t: np.ndarray, target: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return times and targets with a row for every single lost sample, and the times of those that hide a step.
 
-    A target that changes with every sample changed at the lost one too; held, it would be late by a sample. When a target
-    stepped, at the lost sample or after, is unknown.
+    A target that changes with every sample changed at the lost one too; held, it would be late by a sample. Whether a
+    step happened at the lost sample or after is unknown.
     """
     lost = np.flatnonzero(np.abs(np.diff(t) / period - 2.0) < 0.5)
     lost = lost[(lost >= 1) & (lost + 2 < len(t))]
