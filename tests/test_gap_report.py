@@ -73,7 +73,7 @@ def candidates() -> tuple[Candidate, ...]:
         Candidate("kd_scale", CALVES, {"scale": [1.43, 1.44, 1.41, 1.4]}, 6.4, 2.96, 2.5e-4, 2.93,
                   ("kd_scale", "viscous"), "accepted", "removes 84.1% of the excess on held-out windows, p = 0.00025"),
         Candidate("viscous", CALVES, {"damping": [0.21, 0.22, 0.19, 0.2]}, 6.5, 2.95, 2.5e-4, 11.0,
-                  ("kd_scale", "viscous"), "alias", "does as well as kd_scale: these data cannot tell them apart"),
+                  ("kd_scale", "viscous"), "alias", "does as well as kd_scale: not distinguishable with these data"),
         Candidate("asymmetric_friction", (*CALVES, "FR_hip"), several, 11.0, 1.7, 0.0031, 5.2, ("asymmetric_friction",),  # type: ignore[arg-type]
                   "rejected", "explains less than kd_scale (excess falls by 71.5%)"),
         Candidate("torque_delay", (), {"delay": []}, 40.1, -0.002, 0.93, 0.4, ("torque_delay",), "rejected",

@@ -74,7 +74,7 @@ class GapLoopSettings(RecordingConfig):
 
 
 NOT_SEPARABLE = 16
-"""Exit status if no recording tells apart what is left."""
+"""Exit status if no recording separates what is left."""
 
 TARGETS, ANSWER = "next.csv", "next.json"
 """Names of the files in the output folder."""
@@ -121,16 +121,13 @@ def save(result: NextResult, out: Path) -> None:
 
 def text(result: NextResult, file: Path) -> str:
     """Return a result as lines for people; ``file`` is where its targets are."""
-    lines = (
-        [f"already distinguishable by the logs at hand: {', '.join(result.distinguishable)}"]
-        if result.distinguishable
-        else []
-    )
+    known = ", ".join(result.distinguishable)
+    lines = [f"already distinguishable by the logs at hand: {known}"] if known else []
     if result.verdict == "nothing left":
         return "\n".join([*lines, "nothing is left to distinguish: no further recording is needed for the answer"])
     best = result.best
     if best is None:
-        lines.append(f"not separable: none of {result.tried} designs ({result.beyond} more beyond a limit) tells apart")
+        lines.append(f"not separable: none of {result.tried} designs ({result.beyond} more beyond a limit) separates")
     else:
         design = best.design
         parameters = ", ".join(f"{k} {v}" for k, v in design.about(result.rate_hz)["parameters"].items())

@@ -337,7 +337,7 @@ class GapResult:
         before: localisation of the plain model; None if the log is bad.
         after: localisation with what was named.
         not_excited: effect -> excitation to record next.
-        advice: what to record to tell apart what these data cannot, a sentence each.
+        advice: what to record to separate what these data do not, a sentence each.
         bootstrap_share: effect -> share of the bootstraps in which it was named again.
         waterfall: (label, excess) from the plain model down to what remains.
         overlays: windows to look at.

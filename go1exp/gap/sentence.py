@@ -19,7 +19,7 @@ from go1exp.sim.effects.tolerances import Tolerances, declared, effect_class, si
 
 
 def separating(names: Sequence[str]) -> tuple[str, ...]:
-    """Return what to record to tell apart effects that are confounded, each thing once; empty if none of them says."""
+    """Return what to record to separate confounded effects, each thing once; empty if none of them says."""
     how = {name: tolerances.identification(name) for name in names}
     return tuple(
         dict.fromkeys(
@@ -31,7 +31,7 @@ def separating(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def advice(aliases: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
-    """Return what to record to tell apart the members of alias sets."""
+    """Return what to record to separate the members of alias sets."""
     sentences = []
     for names in aliases.values():
         if len(names) > 1:

@@ -1,1 +1,1 @@
-"""The next recording: which motion tells apart what the recordings at hand cannot."""
+"""The next recording: which motion separates what the recordings at hand do not."""

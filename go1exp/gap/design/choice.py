@@ -80,7 +80,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Worth:
-    """How well recordings tell a pair apart.
+    """How well recordings separate a pair.
 
     Attributes:
         distance: T, in units of the noise, squared.
@@ -97,7 +97,7 @@ class Worth:
 
 
 def power(distance: float, gain: float, same: float, values: float, spread: float, alpha: float) -> float:
-    """Return the chance to tell two explanations apart, averaged over the size of the true one.
+    """Return the chance to separate two explanations, averaged over the size of the true one.
 
     With the truth, the log likelihood ratio (twice) is normal about T with variance 4 T; with the rival about -T. It
     must exceed what the rival would reach in ``alpha`` of cases, and ``same`` per value on average.
@@ -152,7 +152,7 @@ class Evaluator:
         return Evidence(table.grams(measured), measured.size[windows], signal, weight, episode)
 
     def worth(self, *parts: Evidence) -> Worth:
-        """Return how well recordings tell the pair apart, all of ``parts`` together."""
+        """Return how well recordings separate the pair, all of ``parts`` together."""
         state, layout = self.state, self.layout
         totals = [(part.weight, layout.total(part.grams)) for part in parts]
         matrix = sum(weight * total[0] for weight, total in totals)
@@ -271,7 +271,7 @@ def _value(worths: Sequence[Worth], goals: Sequence[int]) -> tuple[float, float,
 
 
 def attainable(worths: Sequence[tuple[Worth, ...]], fallback: bool) -> list[int]:
-    """Return the pairs that some design tells apart; if there is none and ``fallback``, those that come nearest."""
+    """Return the pairs that some design separates; if there is none and ``fallback``, those that come nearest."""
     best = [max((w[k].power for w in worths), default=0.0) for k in range(len(worths[0]))] if worths else []
     goals = [k for k, reached in enumerate(best) if reached >= ENOUGH]
     return goals or ([k for k, reached in enumerate(best) if reached == max(best)] if fallback else [])
@@ -284,7 +284,7 @@ def choose(
     settings: DesignSettings,
     on_progress: Callable[[str, float], None],
 ) -> Choice:
-    """Find the design that maximises the least power over the pairs that any design can tell apart.
+    """Find the design that maximises the least power over the pairs that any design separates.
 
     Raises:
         DesignError: if every design goes beyond a limit.

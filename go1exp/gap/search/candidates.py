@@ -164,7 +164,7 @@ class Trial:
                 return "accepted", f"held-out log chi2 falls by {self.mean[k]:.2g}, p = {p:.2g}"
             return "accepted", f"removes {share:.1%} of the excess on held-out windows, p = {p:.2g}"
         if chosen is not None and self.alias[k]:
-            return "alias", f"does as well as {self.names[chosen]}: these data cannot tell them apart"
+            return "alias", f"does as well as {self.names[chosen]}: not distinguishable with these data"
         if self.needed < 0.0 and 1.0 < self.sizes[k] <= thresholds.CLEARLY_BEYOND:
             return "rejected", f"leaves its tolerance by too little ({self.sizes[k]:.2g} of it) to be called missing"
         if self.sizes[k] <= 1.0:

@@ -1,4 +1,4 @@
-"""The stage ``next``: from an answer to the recording that tells apart what it leaves open."""
+"""The stage ``next``: from an answer to the recording that separates what it leaves open."""
 
 from __future__ import annotations
 
@@ -204,7 +204,7 @@ def attitudes(robot: Robot, comparison: Comparison, settings: DesignSettings) ->
 
 
 def reason(evaluator: Evaluator, reached: Worth, choice_beyond: int, settings: DesignSettings) -> str:
-    """Return why no design tells a pair apart."""
+    """Return why no design separates a pair."""
     best = f"no design reaches more than {reached.power:.0%}"
     if evaluator.pair.rival:
         share = f"all but {1.0 - reached.imitated:.1g}"
@@ -226,7 +226,7 @@ def design(
     on_progress: Progress = lambda what, share: None,
     names_only: bool = False,
 ) -> NextResult:
-    """Design the recording that best tells apart what a result leaves open.
+    """Design the recording that best separates what a result leaves open.
 
     Args:
         result: of a search.
@@ -238,7 +238,7 @@ def design(
         names_only: whether to leave out what the recordings did not excite.
 
     Raises:
-        DesignError: if there is nothing that a recording could tell apart, or none is within the limits.
+        DesignError: if there is nothing that a recording could separate, or none is within the limits.
         NotComparable: if the recordings do not suit the robot.
     """
     robot = read_as(robot_from(robot), result).suited(recordings)
@@ -253,7 +253,7 @@ def design(
         limits = limits_of(robot, comparison.windows, targets, settings.limits)
         if not comparison.windows.kp.any():
             raise DesignError("gap next designs motions of drives that follow angles; these are commanded torques")
-        on_progress("what the recordings at hand tell apart", 0.1)
+        on_progress("what the recordings at hand separate", 0.1)
         distinguishable: list[str] = []
         for pairs in lots:  # names first: what was not excited waits until they are distinguishable
             evaluators, before = _left(pairs, comparison, result, distinguishable)
