@@ -242,13 +242,13 @@ def decide(search: Search, named: Sequence[NamedEffect], final: float, accepted:
     (``search.bootstraps=0``) their certainty is unknown.
     """
     settings, first = search.settings, search.first
-    level = [effect for effect, s in search.signal.items() if s >= thresholds.NOT_EXCITED]
+    excited = [effect for effect, s in search.signal.items() if s >= thresholds.NOT_EXCITED]
     if named:
         certain = not settings.bootstraps or any(n.status == "certified" for n in named)
         return "explained" if accepted or (certain and final <= settings.adequate) else "partly explained"
     if first > settings.adequate and not accepted:
         return "unexplained"
-    return "not excited" if len(level) < 0.5 * len(search.signal) else "no gap"
+    return "not excited" if len(excited) < 0.5 * len(search.signal) else "no gap"
 
 
 def evidence(search: Search) -> tuple[Candidate, ...]:
