@@ -197,7 +197,6 @@ STUDIO = (
     "page_process",
     "window",
     "drive_window",
-    "curve_plots",
     "replay",
     "replay_window",
     "sim_window",

@@ -8,12 +8,12 @@ from typing import Any
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 
 from go1exp.evaluate.video import steer
-from go1exp.evaluate.viewer import curve_plots
 from go1exp.evaluate.viewer import requests as ask
 from go1exp.evaluate.viewer.page_server import PUSH, STAND, Gamepad, steered
 from go1exp.evaluate.viewer.walk import WalkView
 from go1exp.evaluate.viewer.window import (
     MESSAGE_LINES,
+    Curves,
     EffectsPanel,
     PushPanel,
     ReleasedSlider,
@@ -68,7 +68,7 @@ class DriveWindow(Window):
         super().__init__("Robot", "Curves")
         self._command, self._pad, self._sticks = [0.0, 0.0, 0.0], pad, False
         self._push = PushPanel(self.ask)
-        self._plots = curve_plots.Curves()
+        self._plots = Curves()
         self._effects, self._slider = EffectsPanel(self.ask), ReleasedSlider()
         self.places = self._push.places
 

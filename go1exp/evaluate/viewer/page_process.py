@@ -28,7 +28,7 @@ class Mailbox:
     def __init__(self, pipe: Connection) -> None:
         """Carry messages over ``pipe``."""
         self._pipe, self._free = pipe, True
-        self._waiting: dict[type[messages.Snapshot], messages.Snapshot] = {}
+        self.waiting: dict[type[messages.Snapshot], messages.Snapshot] = {}
         self._came: list[messages.Event] = []
         self._newest: dict[type[messages.Snapshot], messages.Snapshot] = {}
         self.over = False
@@ -43,18 +43,14 @@ class Mailbox:
 
     def offer(self, snapshot: messages.Snapshot) -> None:
         """Send a snapshot as soon as the other end is free."""
-        self._waiting[type(snapshot)] = snapshot
+        self.waiting[type(snapshot)] = snapshot
         self._pass_on()
 
-    def take_back(self, kind: type[messages.Snapshot]) -> messages.Snapshot | None:
-        """Return a snapshot that still waits here, and keep it no longer."""
-        return self._waiting.pop(kind, None)
-
     def _pass_on(self) -> None:
-        if self._free and self._waiting:
+        if self._free and self.waiting:
             self._free = False
-            self.send("snapshots", list(self._waiting.values()))
-            self._waiting = {}
+            self.send("snapshots", list(self.waiting.values()))
+            self.waiting.clear()
 
     def new_events(self) -> list[messages.Event]:
         """Take in all that has come, and return its events; an end of Studio where the other end has gone."""
@@ -86,49 +82,39 @@ class Mailbox:
         self._pipe.close()
 
 
-class _Events(messages.EventChannel):
-    """The events of a mailbox by Studio's interface."""
+class _Channel:
+    """One kind of a mailbox's messages by Studio's interface."""
 
     def __init__(self, box: Mailbox) -> None:
         self._box = box
 
+    def close(self) -> None:
+        self._box.close()
+
+
+class _Events(_Channel, messages.EventChannel):
     def put(self, event: messages.Event) -> None:
         self._box.send("event", event)
 
     def get(self) -> list[messages.Event]:
         return self._box.new_events()
 
-    def close(self) -> None:
-        self._box.close()
 
-
-class _Snapshots(messages.SnapshotChannel):
-    """The snapshots of a mailbox by Studio's interface."""
-
-    def __init__(self, box: Mailbox) -> None:
-        self._box = box
-
+class _Snapshots(_Channel, messages.SnapshotChannel):
     def put(self, snapshot: messages.Snapshot) -> None:
         self._box.offer(snapshot)
 
     def reclaim_unconsumed(self, snapshot_type: type[messages.Snapshot]) -> messages.Snapshot | None:
-        return self._box.take_back(snapshot_type)
+        return self._box.waiting.pop(snapshot_type, None)
 
     def get(self) -> list[messages.Snapshot]:
         return self._box.new_snapshots()
 
-    def close(self) -> None:
-        self._box.close()
-
 
 def _ends(box: Mailbox) -> dict[str, Any]:
     """Return a mailbox as the four channels of an endpoint of Studio: it carries both ways."""
-    return {
-        "s2v_snapshot": box.snapshots,
-        "s2v_events": box.events,
-        "v2s_events": box.events,
-        "v2s_snapshot": box.snapshots,
-    }
+    ways = ("s2v", "v2s")
+    return {f"{way}_events": box.events for way in ways} | {f"{way}_snapshot": box.snapshots for way in ways}
 
 
 def launch(target: Callable[[endpoints.ViewerEndpoint], None], plugins: list[Any]) -> viewer_handle.ViewerHandle:

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
+from queue import SimpleQueue
 from typing import Any, Protocol
 
 import numpy as np
@@ -47,6 +48,9 @@ SUSPENDED = "the robot is suspended: its trunk cannot be pushed"
 
 SWITCH_S = 1e-4
 """Thread switch interval of the robot's process, s: building another robot must not delay its ticks of 2 ms."""
+
+Built = tuple[Robot, dict[str, float]] | str
+"""A robot with the sizes of its effects, or the reason why it cannot be built."""
 
 ENDS_S = 5.0
 """Time that the robot's process is given to end, s."""
@@ -101,7 +105,7 @@ class Probe:
         """Observe ``server``, whose robot was built from ``body`` and ``config``."""
         self.server, self._body, self._config = server, body, config
         self._effects, self._sizes = catalogue(body.effect, randomize=True)
-        self._builder: _Builder | None = None
+        self._built: SimpleQueue[Built] = SimpleQueue()
         self._rows: deque[NDArray[np.float32]] = deque(maxlen=round(KEPT_S / ROW_S))
         self._packets: deque[tuple[float, float, float]] = deque(maxlen=round(KEPT_S / TICK))
         self._count, self._peer, self._heard = 0, server.peer, math.nan
@@ -121,9 +125,8 @@ class Probe:
         self._peer, self._heard = self.server.peer, arrived
 
     def _tick(self) -> None:
-        if self._builder is not None and self._builder.ready.is_set():
-            self._exchange(self._builder)
-            self._builder = None
+        if not self._built.empty():
+            self._exchange(self._built.get())
         if self.server.counts.ticks % EVERY:
             return
         now = self.server.robot.readings
@@ -162,14 +165,14 @@ class Probe:
         for request in requests:
             match request:
                 case ask.Push(impulse, direction):
-                    self._pushed(impulse, direction)
+                    self._push_robot(impulse, direction)
                 case ask.Reset():
                     self.server.robot.restart()
                     self._message = ""
                 case ask.SetEffects(sizes):
                     self._begin_exchange(dict(sizes))
 
-    def _pushed(self, impulse: float, direction: float) -> None:
+    def _push_robot(self, impulse: float, direction: float) -> None:
         if self._kicker is None:
             self._message = SUSPENDED
             return
@@ -185,40 +188,25 @@ class Probe:
             self._message = " ".join(str(error).split())
             return
         self._message = "another robot is being built ..."
-        self._builder = _Builder(replace(self._body, effect=effect), self._config, sizes)
+        self._built = SimpleQueue()  # one that is being built for an earlier request is dropped
+        arguments = (replace(self._body, effect=effect), sizes, self._built)
+        threading.Thread(target=self._build, args=arguments, daemon=True).start()
 
-    def _exchange(self, built: _Builder) -> None:
-        """Let the new robot continue from the state of the present one, between two ticks."""
-        if built.robot is None:
-            self._message = built.problem
-            return
-        built.robot.take_over(self.server.robot)
-        self.server.robot, self._kicker = built.robot, _kicker(built.robot)
-        self._sizes, self._message = built.sizes, ""
-
-
-class _Builder:
-    """Builds a robot in a thread, since that takes tens of ticks.
-
-    Attributes:
-        robot: None if it cannot be built.
-        problem: the reason.
-        sizes: of its effects.
-        ready: set at the end.
-    """
-
-    def __init__(self, body: Body, config: SimConfig, sizes: dict[str, float]) -> None:
-        self.robot: Robot | None = None
-        self.problem, self.sizes, self.ready = "", sizes, threading.Event()
-        threading.Thread(target=self._build, args=(body, config), daemon=True).start()
-
-    def _build(self, body: Body, config: SimConfig) -> None:
+    def _build(self, body: Body, sizes: dict[str, float], built: SimpleQueue[Built]) -> None:
+        """Build a robot in a thread, since that takes tens of ticks; if it cannot be built, give the reason."""
         try:
-            self.robot = Robot(body, config)
+            built.put((Robot(body, self._config), sizes))
         except (ConfigError, Expected) as error:
-            self.problem = " ".join(str(error).split())
-        finally:
-            self.ready.set()
+            built.put(" ".join(str(error).split()))
+
+    def _exchange(self, built: Built) -> None:
+        """Let the new robot continue from the state of the present one, between two ticks."""
+        if isinstance(built, str):
+            self._message = built
+            return
+        new, self._sizes = built
+        new.take_over(self.server.robot)
+        self.server.robot, self._kicker, self._message = new, _kicker(new), ""
 
 
 def _kicker(made: Robot) -> Kicker | None:

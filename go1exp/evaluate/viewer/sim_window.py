@@ -19,14 +19,16 @@ from go1exp import robot
 from go1exp.deploy.sim_robot.machine import TICK, Body
 from go1exp.deploy.sim_robot.server import TRUTH
 from go1exp.evaluate.viewer import requests as ask
-from go1exp.evaluate.viewer.curve_plots import PLAIN, TALL, Curves
 from go1exp.evaluate.viewer.drive_window import PUSH_KEY, SLOW
 from go1exp.evaluate.viewer.requests import catalogue, lines
 from go1exp.evaluate.viewer.session import PUSH_SHOWN_S, SPAN, History, PushMade
 from go1exp.evaluate.viewer.sim_process import FORCE, ROW_S, TORQUE, Frame, Link
-from go1exp.evaluate.viewer.walk import Arrow, Series, push_arrow, runs_of
+from go1exp.evaluate.viewer.walk import Series, Timed, push_arrow, runs_of
 from go1exp.evaluate.viewer.window import (
     MESSAGE_LINES,
+    PLAIN,
+    TALL,
+    Curves,
     EffectsPanel,
     PushPanel,
     Vec2,
@@ -71,18 +73,12 @@ class Intervals:
 
 
 @dataclass(frozen=True)
-class SimView:
+class SimView(Timed):
     """Content of the panels.
 
     Attributes:
         frame: the newest one.
-        t: times of the curves, 0 for now, s.
-        height: of the trunk over the ground, m; NaN for a suspended robot.
         velocity: true forward, left, m/s, and yaw rate, rad/s, in the trunk's frame.
-        torque: twelve, over the limit.
-        contacts: contact intervals of each leg, s.
-        pushes: times of pushes, s.
-        arrows: in the scene.
         every: intervals of all packets of the client.
         new: intervals of packets that differ from the one before: the cycles of a client that repeats each command.
         rate: packets received in the last second.
@@ -91,13 +87,7 @@ class SimView:
     """
 
     frame: Frame
-    t: list[float]
-    height: list[float]
     velocity: Series
-    torque: Series
-    contacts: tuple[tuple[tuple[float, float], ...], ...]
-    pushes: list[float]
-    arrows: tuple[Arrow, ...]
     every: Intervals
     new: Intervals
     rate: int

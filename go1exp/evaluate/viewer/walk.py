@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,20 +55,25 @@ class Arrow:
     rgb: tuple[float, float, float]
 
 
-class Timed(Protocol):
-    """Data of the plots over the last seconds."""
+@dataclass(frozen=True)
+class Timed:
+    """Curves of the last seconds that all windows show.
 
-    @property
-    def t(self) -> list[float]:
-        """Times of the curves, 0 for now, s."""
+    Attributes:
+        t: times of the curves, 0 for now, s.
+        height: of the trunk over the ground, m; NaN for a suspended robot.
+        torque: twelve, over the limit.
+        contacts: contact intervals of each leg, s.
+        pushes: times of pushes, s.
+        arrows: in the scene.
+    """
 
-    @property
-    def contacts(self) -> tuple[tuple[tuple[float, float], ...], ...]:
-        """Contact intervals of each leg, s."""
-
-    @property
-    def pushes(self) -> list[float]:
-        """Times of pushes, s."""
+    t: list[float]
+    height: list[float]
+    torque: Series
+    contacts: tuple[tuple[tuple[float, float], ...], ...]
+    pushes: list[float]
+    arrows: tuple[Arrow, ...]
 
 
 @dataclass(frozen=True)
@@ -88,7 +92,7 @@ class Reward:
 
 
 @dataclass(frozen=True)
-class WalkView:
+class WalkView(Timed):
     """Content of the panels.
 
     Attributes:
@@ -105,17 +109,11 @@ class WalkView:
         falls: so far.
         message: for the user.
         physics_dt: step in force, s.
-        t: times of the curves, 0 for now, s.
         command_curves: three.
         true: three.
         estimated: three, or none.
-        height: of the trunk over the ground, m.
-        torque: twelve, over the limit.
-        contacts: contact intervals of each leg, s.
-        pushes: times of pushes, s.
         rewards: all.
         total: of all rewards, per second.
-        arrows: in the scene.
     """
 
     label: str
@@ -131,17 +129,11 @@ class WalkView:
     falls: int
     message: str
     physics_dt: float
-    t: list[float]
     command_curves: Series
     true: Series
     estimated: Series
-    height: list[float]
-    torque: Series
-    contacts: tuple[tuple[tuple[float, float], ...], ...]
-    pushes: list[float]
     rewards: tuple[Reward, ...]
     total: float
-    arrows: tuple[Arrow, ...]
 
 
 class WalkShow:
@@ -151,7 +143,7 @@ class WalkShow:
         """Build the scene."""
         self.session = session
         self._effects = lines(session.robots.effects)
-        self._core: Any = None
+        self._stage = Stage(session.core)
         self._speed = np.zeros(2)
         self._clock, self._then, self._achieved = time.perf_counter(), session.time, 1.0
         self._shown = -math.inf
@@ -159,17 +151,13 @@ class WalkShow:
 
     def _place(self) -> None:
         """Set the robot's pose in the scene; a new ground is a new model."""
-        if self._core is not self.session.core:
-            old, self._core = getattr(self, "_stage", None), self.session.core
-            if old is None or old.core.terrain.config != self._core.terrain.config:
-                self._stage = Stage(self._core)
-                self.model, self.data = self._stage.model, self._stage.data
-            else:
-                old.core = self._core
-        if self._stage.place(0):
-            self._stage = Stage(self._core)
+        stage, core = self._stage, self.session.core
+        other = stage.core.terrain.config != core.terrain.config
+        stage.core = core
+        if other or stage.place(0):
+            self._stage = Stage(core)
             self._stage.place(0)
-            self.model, self.data = self._stage.model, self._stage.data
+        self.model, self.data = self._stage.model, self._stage.data
 
     def ask(self, request: ask.Request) -> None:
         """Apply a request of the user."""
