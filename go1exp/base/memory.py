@@ -36,7 +36,7 @@ def too_much(needed: float, available: float) -> str:
 
 
 def _of_machine() -> int | None:
-    """Return the machine's memory that can be had without swapping, B; all that it has where only that is told."""
+    """Return the machine's memory that can be had without swapping, B; all of it where no more is known."""
     try:
         for line in Path("/proc/meminfo").read_text().splitlines():
             if line.startswith("MemAvailable:"):

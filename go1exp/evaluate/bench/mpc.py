@@ -18,7 +18,7 @@ from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TaskConfig
 
 COMMANDS = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 1.0))
-"""What the robots are drive, one each: x, y in m/s, yaw rate in rad/s."""
+"""Commands of the robots, one each: x, y in m/s, yaw rate in rad/s."""
 
 
 class _Timed:

@@ -118,12 +118,12 @@ def curves(
     drawn: list[Curve | None] = []
     notes = []
     for name in wanted:
-        lacking = [run for group in made for run in group.runs if name not in metrics[run.folder].columns]
-        if lacking:
-            known = metrics[lacking[0].folder].available
+        missing = [run for group in made for run in group.runs if name not in metrics[run.folder].columns]
+        if missing:
+            known = metrics[missing[0].folder].available
             close = f"; it has {', '.join(known[:6])}, ..." if known else ""
-            others = f" and {len(lacking) - 1} more runs" if len(lacking) > 1 else ""
-            notes.append(f"{name}: is not in the metrics of {lacking[0].label}{others}{close}")
+            others = f" and {len(missing) - 1} more runs" if len(missing) > 1 else ""
+            notes.append(f"{name}: is not in the metrics of {missing[0].label}{others}{close}")
         drawn += [_curve(group, metrics, name, axis, points) for axis in AXES for group in made]
     return [curve for curve in drawn if curve is not None], notes
 

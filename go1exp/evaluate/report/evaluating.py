@@ -41,7 +41,7 @@ class Wanted:
 
 
 def missing(runs: Sequence[Run], protocols: Sequence[Chosen | None] = (None,)) -> list[Wanted]:
-    """Return which of these evaluations (None: the grid) runs with a checkpoint lack."""
+    """Return the evaluations (None: the grid) that runs with a checkpoint do not have."""
     return [
         Wanted(run, protocol)
         for run in runs

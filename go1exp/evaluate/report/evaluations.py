@@ -87,10 +87,10 @@ def evaluations(study: Study) -> list[Evaluation]:
         study.notes.append(f"{_listed(old)}: eval.json without eval.parquet; eval=true makes both")
     made = [_evaluation(name, study) for name in [GRID, *sorted(set(known) - {GRID})] if name in known]
     for evaluation in made:
-        lacking = [run.label for run in study.runs if evaluation.name not in names(run)]
-        if lacking:
+        missing = [run.label for run in study.runs if evaluation.name not in names(run)]
+        if missing:
             how = "" if evaluation.name == GRID else f" protocol={evaluation.name}"
-            study.notes.append(f"{evaluation.name}: no evaluation of {_listed(lacking)}; eval=true{how} makes it")
+            study.notes.append(f"{evaluation.name}: no evaluation of {_listed(missing)}; eval=true{how} makes it")
     if not made:
         study.notes.append(f"no run has an evaluation; eval=true makes them ({len(study.runs)} runs)")
     return [evaluation for evaluation in made if evaluation.runs]

@@ -67,7 +67,7 @@ class ReportSettings:
         correction: holm bounds the chance of any false positive in a study by 5 %; none corrects nothing.
         paired: pair runs by their seed in comparisons; at least six pairs are needed for significance.
         unfinished: include running, stopped and failed runs.
-        eval: evaluate runs that lack an evaluation, by ``protocol``: the grid as ``evaluation`` says.
+        eval: evaluate runs without an evaluation, by ``protocol``: the grid as ``evaluation`` says.
         evaluation: how.
         points: number of points of a learning curve.
         wandb: Weights & Biases to log the tables to, offline or online; null for none.

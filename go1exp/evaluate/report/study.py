@@ -88,7 +88,7 @@ class Group:
 
     Attributes:
         name: unique name.
-        settings: keys in which groups differ, with this group's values; "-" for a key that it lacks.
+        settings: keys in which groups differ, with this group's values; "-" for a missing key.
         runs: by seed.
     """
 
@@ -329,11 +329,11 @@ def _by_keys(group: Group, usual: Mapping[str, str], count: int) -> str:
 
 
 def _missing(key: str, known: Mapping[str, Any]) -> str:
-    """Return the longest part of a key's path that a configuration lacks: a term, rather than each of its settings."""
+    """Return the longest part of a key's path that a configuration does not have: a term, rather than each setting."""
     parts = key.split(".")
     paths = [".".join(parts[:length]) for length in range(1, len(parts) + 1)]
-    lacking = (p for p in paths if not any(name == p or name.startswith(f"{p}.") for name in known))
-    return next(lacking, key)
+    absent = (p for p in paths if not any(name == p or name.startswith(f"{p}.") for name in known))
+    return next(absent, key)
 
 
 def _by_job(runs: Sequence[Run]) -> str:
