@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,7 +144,7 @@ class WalkShow:
         """Build the scene."""
         self.session = session
         self._effects = lines(session.robots.effects)
-        self._stage = Stage(session.core)
+        self._core: Any = None
         self._speed = np.zeros(2)
         self._clock, self._then, self._achieved = time.perf_counter(), session.time, 1.0
         self._shown = -math.inf
@@ -151,13 +152,17 @@ class WalkShow:
 
     def _place(self) -> None:
         """Set the robot's pose in the scene; a new ground is a new model."""
-        stage, core = self._stage, self.session.core
-        other = stage.core.terrain.config != core.terrain.config
-        stage.core = core
-        if other or stage.place(0):
-            self._stage = Stage(core)
+        if self._core is not self.session.core:
+            old, self._core = getattr(self, "_stage", None), self.session.core
+            if old is None or old.core.terrain.config != self._core.terrain.config:
+                self._stage = Stage(self._core)
+                self.model, self.data = self._stage.model, self._stage.data
+            else:
+                old.core = self._core
+        if self._stage.place(0):
+            self._stage = Stage(self._core)
             self._stage.place(0)
-        self.model, self.data = self._stage.model, self._stage.data
+            self.model, self.data = self._stage.model, self._stage.data
 
     def ask(self, request: ask.Request) -> None:
         """Apply a request of the user."""
