@@ -31,6 +31,7 @@ from go1exp.sim.actuator.actuator_net import ActuatorNet, NetInfo, Provenance, g
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TaskConfig, parse_task
 from tests.selection import changed_since, chosen
+from tests.small_run import made_once, trained
 
 torch.set_num_threads(1)
 
@@ -127,6 +128,18 @@ def make_core(make_task: Callable[..., TaskConfig]) -> Callable[..., Go1Core]:
         return Go1Core(make_task("backend.threads=1", *overrides), num_envs, **kwargs)
 
     return make
+
+
+@pytest.fixture(scope="session")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Path of a bundle of two tiny iterations: its policy hardly moves, so that a robot stands."""
+    from go1exp.deploy.export.build import build
+
+    def make(path: Path) -> None:
+        run = trained(tmp_path_factory.mktemp("walk") / "run", "actuator.kp=35", "actuator.kd=0.7")
+        path.write_bytes(build(run, seconds=0.2))
+
+    return str(made_once(tmp_path_factory, "walk.zip", make))
 
 
 @pytest.fixture

@@ -20,18 +20,12 @@ from go1exp.config.schema.registry import ConfigError
 from go1exp.config.schema.training import ROWS, StopRule
 from go1exp.evaluate.asynchronous import answered, score
 from go1exp.sim.task import parse_train
-from go1exp.train import checkpoint, early_stop, run_folder, trainer
+from go1exp.train import checkpoint, early_stop, run_folder
 from go1exp.train.asynchronous import AsyncEvaluation
 from go1exp.train.early_stop import EarlyStop
-from tests.small_run import SMALL
+from tests.small_run import SMALL, train
 
 BRIEF = ("eval.x=[0.5]", "eval.y=[]", "eval.yaw=[]", "eval.episodes=2", "eval.duration_s=0.4", "eval.settle_s=0.2")
-
-
-def train(run: Path, *overrides: str) -> trainer.AdaptivePPO:
-    container = compose("train", [*SMALL, *overrides])
-    run_folder.write(run, container)
-    return trainer.train(parse_train(container), container, run)
 
 
 def rows(file: Path) -> list[dict[str, float]]:
@@ -42,7 +36,7 @@ def rows(file: Path) -> list[dict[str, float]]:
 
 
 def test_a_job_gives_the_figures_of_its_policy(tmp_path: Path) -> None:
-    train(tmp_path, "checkpoint.every=1")
+    train(tmp_path, (*SMALL, "checkpoint.every=1"))
     settings = dataclasses.asdict(parse_train(compose("train", [*SMALL, *BRIEF])).eval)
     job = {"kind": "evaluate", "iteration": 1, "steps": 16, "policy": str(tmp_path / "checkpoints/000001.pt")}
     result = answered(tmp_path, {**job, "settings": settings})
@@ -67,8 +61,8 @@ def test_the_best_policy_is_that_of_the_lowest_score(tmp_path: Path) -> None:
 
 @pytest.mark.slow("go1exp/evaluate/", "go1exp/train/")
 def test_policies_are_evaluated_and_the_best_is_kept(tmp_path: Path) -> None:
-    plain = train(tmp_path / "plain", "ppo.iterations=4")
-    evaluation = train(tmp_path / "run", "ppo.iterations=4", "eval.every=2", *BRIEF)
+    plain = train(tmp_path / "plain", (*SMALL, "ppo.iterations=4"))
+    evaluation = train(tmp_path / "run", (*SMALL, "ppo.iterations=4", "eval.every=2", *BRIEF))
     table = rows(tmp_path / "run/evals.csv")
     assert [(r["iteration"], r["steps"]) for r in table] == [(2, 32), (4, 64)]
     best = min(table, key=lambda r: r["score"])
@@ -189,7 +183,7 @@ def test_nothing_is_started_where_nothing_is_asked_for(tmp_path: Path) -> None:
 
 @pytest.mark.slow("go1exp/evaluate/", "go1exp/train/")
 def test_videos_are_made(tmp_path: Path) -> None:
-    train(tmp_path / "run", "ppo.iterations=2", "video.every=2", "video.seconds=0.4")
+    train(tmp_path / "run", (*SMALL, "ppo.iterations=2", "video.every=2", "video.seconds=0.4"))
     film = tmp_path / "run/videos/000002.mp4"
     if film.is_file():  # a machine without any graphics has none, and says so
         assert film.stat().st_size > 1000
@@ -209,10 +203,10 @@ def test_time_on_the_ground_counts_as_the_whole_command() -> None:
 
 def test_a_training_ends_when_a_figure_is_good_enough_and_is_complete(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="stop.figure: unknown metric 'steps_total'"):
-        ppo = train(tmp_path, "ppo.iterations=6", "stop.figure=steps_total", "stop.at=1.0")
+        ppo = train(tmp_path, (*SMALL, "ppo.iterations=6", "stop.figure=steps_total", "stop.at=1.0"))
     assert ppo.iteration == 6  # no such metric: no rule
     rule = ("ppo.iterations=6", "stop.figure=train/learning_rate", "stop.better=lower", "stop.at=1.0")
-    ppo = train(tmp_path / "early", *rule)
+    ppo = train(tmp_path / "early", (*SMALL, *rule))
     assert ppo.iteration == 1
     assert [p.name for p in checkpoint.checkpoints(tmp_path / "early")] == ["000001.pt"]
     config = parse_train(compose("train", [*SMALL, *rule]))

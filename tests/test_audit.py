@@ -23,29 +23,21 @@ from go1exp.cli.record import AUDIT
 from go1exp.config.schema import registry
 from go1exp.logs import excitations
 from go1exp.logs.audit import AuditReport, audit, audit_file, clock_flaws, signals
-from go1exp.logs.recording import Meta, Recording, RecordingError, joint_channels, write
+from go1exp.logs.recording import Recording, RecordingError, joint_channels, write
 from go1exp.robot import EFFORT_LIMIT, JOINT_POS_LIMITS, JOINTS, NOMINAL_STANCE, per_joint, soft_limits
+from tests.made import meta as made_meta
 
 RATE = 500.0
 SECONDS = 6
 ROWS = 3000
 ENCODER = 3.0e-5  # rad
-META = Meta(
-    robot="go1",
-    joints=JOINTS,
-    rate_hz=RATE,
+META = made_meta(
     base="floating",
     base_quat=None,
     kp=(20.0,) * 12,
     kd=(0.5,) * 12,
     tau_limit=tuple(per_joint(EFFORT_LIMIT)),
-    excitation=None,
     episode="synthetic",
-    repeat_of=None,
-    source="simulated",
-    tool="test",
-    versions={},
-    notes="",
 )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,6 @@ from go1exp.sim.physics.scene import Sensors, build_model
 from go1exp.sim.task import TaskConfig
 from go1exp.sim.terrain import build_terrain
 
-FEET = [f"{leg}_foot" for leg in robot.LEGS]
 Build = Callable[..., MujocoCpu]
 
 
@@ -120,21 +118,6 @@ def test_a_batch_is_a_serial_loop_over_its_own_models_bit_for_bit(make_backend: 
     assert touched
 
 
-DERIVED = ["body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "actuator_acc0"]
-
-
-def test_constants_are_derived_in_masked_rows_only(make_backend: Build) -> None:
-    backend = make_backend(4)
-    randomize(backend)
-    before = [backend.env_model(i).dof_invweight0.copy() for i in range(4)]
-    backend.field("body_mass").mul_(1.5)
-    mask = torch.tensor([False, True, False, True])
-    backend.derive_constants(~everyone(4))
-    backend.derive_constants(mask)
-    changed = [not np.array_equal(backend.env_model(i).dof_invweight0, before[i]) for i in range(4)]
-    assert changed == mask.tolist()
-
-
 def test_contact_forces_after_a_reset_are_those_of_the_new_state(make_backend: Build) -> None:
     backend = make_backend(2)
     block = backend.sensors.foot_contact
@@ -146,34 +129,6 @@ def test_contact_forces_after_a_reset_are_those_of_the_new_state(make_backend: B
         force = backend.sensordata[:, block].reshape(2, 4, 4)[..., 1:]
         assert ((count > 0) == touching).all()
         assert ((force.norm(dim=-1) > 1.0) == touching).all()
-
-
-@GROUNDS
-def test_a_saved_state_continues_bit_for_bit_in_another_batch(make_backend: Build, ground: tuple[str, ...]) -> None:
-    n = 3
-    first, second = make_backend(n, *ground), make_backend(n, *ground)
-    randomize(first, seed=1)
-    first.reset(everyone(n), *initial(n))
-    for ctrl in torques(n, 100):
-        first.step(ctrl)
-    file = io.BytesIO()
-    torch.save(first.state_dict(), file)
-    file.seek(0)
-    randomize(second, seed=2)  # somewhere else, with other robots
-    second.reset(everyone(n), *initial(n, seed=4))
-    second.step(torques(n, 1)[0])
-    second.load_state_dict(torch.load(file, weights_only=True))
-    assert torch.equal(first.qpos, second.qpos)
-    for ctrl in torques(n, 100, seed=1):
-        first.step(ctrl)
-        second.step(ctrl)
-        assert torch.equal(first.qpos, second.qpos)
-        assert torch.equal(first.qvel, second.qvel)
-        assert torch.equal(first.sensordata, second.sensordata)
-    for i in range(n):
-        assert first.env_data(i).time == second.env_data(i).time == pytest.approx(0.4)
-        for name in ("body_mass", *DERIVED):
-            np.testing.assert_array_equal(getattr(first.env_model(i), name), getattr(second.env_model(i), name))
 
 
 def test_the_step_tensors_stay_the_same_objects_in_memory(make_backend: Build) -> None:
@@ -218,14 +173,9 @@ def test_the_forces_on_the_feet_of_a_standing_robot_add_up_to_its_weight(
     contact = stand(make_backend(2, *ground), 1.2)
     assert (contact[..., 0] > 0).all()
     force = contact[..., 1:].sum(axis=1)  # over the feet
-    np.testing.assert_allclose(np.abs(force[:, 2]), mass * 9.81, rtol=5e-3)
+    np.testing.assert_allclose(force[:, 2], mass * 9.81, rtol=5e-3)
     np.testing.assert_allclose(force[:, :2], 0.0, atol=1.0)
-    assert (np.abs(contact[..., 3]) > 15.0).all()  # each of them bears a share
-
-
-def test_the_contact_force_is_the_one_on_the_foot_as_the_sensors_say(make_backend: Build) -> None:
-    """`Sensors.foot_contact`: "the net contact force on it", so the ground pushes a foot up."""
-    assert (stand(make_backend(1), 0.5)[..., 3] > 0.0).all()
+    assert (contact[..., 3] > 15.0).all()  # each of them bears a share; the ground pushes it up
 
 
 def random_poses(backend: MujocoCpu, n: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -258,13 +208,7 @@ def counted(model: mujoco.MjModel, qpos: np.ndarray) -> dict[str, Any]:
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_forward(model, data)
-    found: dict[str, Any] = {
-        "foot": np.zeros(4),
-        "thigh": np.zeros(4),
-        "calf": np.zeros(4),
-        "trunk": 0,
-        "hip": np.zeros(4),
-    }
+    found: dict[str, Any] = {"trunk": 0, **{part: np.zeros(4) for part in ("foot", "thigh", "calf", "hip")}}
     for contact in data.contact:
         assert model.geom("floor").id in contact.geom
         geom = next(int(g) for g in contact.geom if g != model.geom("floor").id)
@@ -354,15 +298,6 @@ def test_a_known_posture_touches_with_the_right_part(
     flags = {"foot": s.foot_contact, "thigh": s.thigh_contact, "calf": s.calf_contact, "trunk": s.trunk_contact}
     for part, flag in flags.items():
         assert flag.all() if part in touching else not flag.any(), part
-
-
-def test_a_robot_never_meets_itself(make_backend: Build) -> None:
-    backend = make_backend(50)
-    qpos, qvel = random_poses(backend, 50)
-    qpos[:, 2] += 1.0
-    backend.reset(everyone(50), qpos, qvel)
-    assert not backend.sensordata[:, backend.sensors.link_contacts].any()
-    assert not backend.sensordata[:, backend.sensors.foot_contact].any()
 
 
 def test_a_fault_is_seen_and_not_healed(make_backend: Build, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

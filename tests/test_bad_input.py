@@ -24,8 +24,9 @@ from go1exp.config.schema.registry import ConfigError
 from go1exp.gap.data.cutting import cut
 from go1exp.gap.result import GapSettings
 from go1exp.logs import recording
-from go1exp.logs.recording import Meta, Recording, RecordingError
+from go1exp.logs.recording import Recording, RecordingError
 from go1exp.robot import JOINTS
+from tests.made import meta
 
 Run = Callable[..., tuple[int, str]]
 
@@ -46,12 +47,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
 
 def made(folder: Path, episode: str, rows: int, kp: float = 20.0) -> Path:
     """A recording of a hung Go1 at 500 Hz."""
-    count = len(JOINTS)
-    meta = Meta(
-        robot="go1", joints=JOINTS, rate_hz=500.0, base="fixed", base_quat=(1.0, 0.0, 0.0, 0.0), kp=(kp,) * count,
-        kd=(0.5,) * count, tau_limit=None, excitation=None, episode=episode, repeat_of=None, source="simulated",
-        tool="test", versions={}, notes="",
-    )  # fmt: skip
+    about = meta(kp=(kp,) * len(JOINTS), kd=(0.5,) * len(JOINTS), episode=episode)
     t = np.arange(rows) / 500.0
     wave = {
         f"{quantity}_{joint}": 0.1 * np.sin(9.0 * t)
@@ -59,7 +55,7 @@ def made(folder: Path, episode: str, rows: int, kp: float = 20.0) -> Path:
         for joint in JOINTS
     }
     folder.mkdir(parents=True, exist_ok=True)
-    recording.write(folder / f"{episode}.parquet", Recording(meta, {"t": t, **wave}))
+    recording.write(folder / f"{episode}.parquet", Recording(about, {"t": t, **wave}))
     return folder
 
 

@@ -27,10 +27,10 @@ from go1exp.config.schema import registry
 from go1exp.config.schema.registry import ConfigError
 from go1exp.sim.env.camera import RenderingUnavailable, choose_gl
 from go1exp.sim.task import parse_train
-from go1exp.train import run_folder, trainer
+from go1exp.train import run_folder
 from tests.command import WITH_MODULES, refuse, run_alone
 from tests.command import run as cli
-from tests.small_run import small
+from tests.small_run import small, trained
 
 SMALL = small("ppo=paper")
 HEAVY = {"mujoco", "stable_baselines3", "gymnasium", "torch.nn", "wandb", "tensorboard", "matplotlib", "scipy"}
@@ -54,11 +54,7 @@ def assert_refused(tmp_path: Path, arguments: list[str], *said: str) -> None:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of two tiny iterations."""
-    run = tmp_path_factory.mktemp("cli") / "run"
-    container = compose("train", SMALL)
-    run_folder.write(run, container)
-    trainer.train(parse_train(container), container, run)
-    return run
+    return trained(tmp_path_factory.mktemp("cli") / "run", "ppo=paper")
 
 
 # ---------------------------------------------------------------------- refusals

@@ -22,6 +22,7 @@ from go1exp.train import checkpoint, policy, run_folder, trainer
 from go1exp.train.device import DevicePPO
 from go1exp.train.policy import load_network
 from go1exp.train.ppo import AdaptivePPO
+from tests import small_run
 from tests.small_run import SMALL
 
 O, C = 48, 9 + 12 + 16 + 12
@@ -39,11 +40,7 @@ def learner(config: TrainConfig, kind: type[AdaptivePPO] = AdaptivePPO) -> Any:
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run folder of a policy whose critic saw more, on mirrored samples."""
-    container = compose("train", [*SMALL, "critic=privileged", "ppo.symmetry=true"])
-    run = tmp_path_factory.mktemp("critic") / "run"
-    run_folder.write(run, container)
-    trainer.train(parse_train(container), container, run)
-    return run
+    return small_run.trained(tmp_path_factory.mktemp("critic") / "run", "critic=privileged", "ppo.symmetry=true")
 
 
 def test_the_critics_columns_stand_behind_the_policys_and_change_none_of_them() -> None:

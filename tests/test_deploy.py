@@ -26,7 +26,6 @@ from go1exp.config.compose import compose
 from go1exp.config.schema.physics import MUJOCO_CONTACT, ContactConfig
 from go1exp.config.schema.registry import ConfigError, Term, members
 from go1exp.deploy.estimation import from_json, go1, make_filter, sample, to_json
-from go1exp.deploy.export.build import build
 from go1exp.deploy.runtime import walk
 from go1exp.deploy.runtime.bundle import load
 from go1exp.deploy.runtime.commands import (
@@ -63,45 +62,19 @@ from go1exp.logs.record.plan import make_motion
 from go1exp.logs.recording import VECTORS
 from go1exp.robot.go1_fields import JOINTS, MOTOR_NAMES
 from go1exp.robot.messages import Link, LowCmd, LowState
-from go1exp.sim.task import parse_train
-from go1exp.train import run_folder, trainer
 from tests.lockstep import BEGIN, Spoil, lockstep
+from tests.made import low_state
 from tests.small_run import SMALL
 
 BUSY = 5.0
 """Age of a state, s, at which a robot counts as lost where real time passes: the machine may be busy."""
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of two tiny iterations: its policy hardly moves, so that a robot stands."""
-    run = tmp_path_factory.mktemp("deploy") / "run"
-    container = compose("train", (*SMALL, "actuator.kp=35", "actuator.kd=0.7"))
-    run_folder.write(run, container)
-    trainer.train(parse_train(container), container, run)
-    return run
-
-
-@pytest.fixture(scope="module")
-def file(run: Path) -> str:
-    """Its bundle."""
-    path = run / "walk.zip"
-    path.write_bytes(build(run, seconds=0.2))
-    return str(path)
-
-
 def make_state(t: float = 0.0, **changes: Any) -> LowState:
     rng = np.random.default_rng(abs(int(1e6 * t)))
-    usual: dict[str, Any] = {
-        "joint_pos": robot.NOMINAL_STANCE + 0.01 * rng.normal(size=12),
-        "joint_vel": rng.normal(size=12),
-        "joint_torque": rng.normal(size=12),
-        "imu_quat": np.array([1.0, 0.0, 0.0, 0.0]),
-        "imu_gyro": 0.1 * rng.normal(size=3),
-        "imu_acc": np.array([0.0, 0.0, 9.81]),
-        "foot_force": np.full(4, 30.0),
-    }
-    return LowState(t, **{**usual, "clock": t, **changes})
+    noisy = {"joint_pos": robot.NOMINAL_STANCE + 0.01 * rng.normal(size=12), "joint_vel": rng.normal(size=12)}
+    noisy |= {"joint_torque": rng.normal(size=12), "imu_gyro": 0.1 * rng.normal(size=3)}
+    return low_state(t, **{**noisy, "clock": t, **changes})
 
 
 def make_command(**changes: Any) -> LowCmd:
@@ -112,8 +85,8 @@ def make_command(**changes: Any) -> LowCmd:
 
 
 @pytest.mark.parametrize("start", ["standing", "lying", "suspended"])
-def test_a_robot_begins_at_rest(file: str, start: str) -> None:
-    made = Robot(bundle_task(file, {}), sim_config({"start": start, "noise": 0.0}))
+def test_a_robot_begins_at_rest(bundle: str, start: str) -> None:
+    made = Robot(bundle_task(bundle, {}), sim_config({"start": start, "noise": 0.0}))
     state, true = made.sense()
     assert np.abs(state.joint_vel).max() < 0.3
     np.testing.assert_allclose(np.linalg.norm(state.imu_acc), 9.81, rtol=0.02)
@@ -124,8 +97,8 @@ def test_a_robot_begins_at_rest(file: str, start: str) -> None:
         assert height[0] < true[2] < height[1]
 
 
-def test_drives_obey_and_brake_when_nobody_speaks(file: str) -> None:
-    made = Robot(bundle_task(file, {}), sim_config({"start": "suspended", "noise": 0.0}))
+def test_drives_obey_and_brake_when_nobody_speaks(bundle: str) -> None:
+    made = Robot(bundle_task(bundle, {}), sim_config({"start": "suspended", "noise": 0.0}))
     target = robot.NOMINAL_STANCE + 0.1
     made.apply(make_command(joint_target=target, kp=np.full(12, 40.0), kd=np.full(12, 1.0)))
     for _ in range(500):
@@ -144,9 +117,9 @@ def test_drives_obey_and_brake_when_nobody_speaks(file: str) -> None:
     assert not made.braking
 
 
-def test_a_state_is_one_instant_of_the_robot(file: str) -> None:
+def test_a_state_is_one_instant_of_the_robot(bundle: str) -> None:
     """Torque = kp (target - q) - kd qd; a new target counts for half of its first tick. The IMU is the trunk's."""
-    made = Robot(bundle_task(file, {}), sim_config({"noise": 0.0}))
+    made = Robot(bundle_task(bundle, {}), sim_config({"noise": 0.0}))
     kp, kd, rng = np.full(12, 35.0), np.full(12, 0.7), np.random.default_rng(0)
     target = robot.NOMINAL_STANCE
     for k in range(50):
@@ -162,8 +135,8 @@ def test_a_state_is_one_instant_of_the_robot(file: str) -> None:
         np.testing.assert_allclose(state.imu_gyro, true[10:13], atol=1e-12)
 
 
-def test_noise_is_that_of_table_ii(file: str) -> None:
-    loud, quiet = (Robot(bundle_task(file, {}), sim_config({"noise": noise})) for noise in (1.0, 0.0))
+def test_noise_is_that_of_table_ii(bundle: str) -> None:
+    loud, quiet = (Robot(bundle_task(bundle, {}), sim_config({"noise": noise})) for noise in (1.0, 0.0))
     truth = quiet.sense()[0]
     states = [loud.sense()[0] for _ in range(1000)]
     for name in ("joint_pos", "joint_vel", "imu_gyro"):
@@ -221,17 +194,17 @@ def test_of_the_truth_the_newest_is_kept_and_memory_does_not_grow() -> None:
     ids=["order", "robot", "estimator"],
 )
 def test_a_bundle_that_is_not_for_a_go1_never_reaches_its_motors(
-    change: dict[str, Any], message: str, file: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    change: dict[str, Any], message: str, bundle: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    whole = load(file)
+    whole = load(bundle)
     other = dataclasses.replace(whole, metadata=dataclasses.replace(whole.metadata, **change))
     monkeypatch.setattr("go1exp.deploy.runtime.bundle.load", lambda path: other)
     said: list[str] = []
     with pytest.raises((Expected, ConfigError), match=message):
-        run_job(Job(file, "sim", Plan(), str(tmp_path / "out")), said.append)
+        run_job(Job(bundle, "sim", Plan(), str(tmp_path / "out")), said.append)
     assert said == []
     assert not (tmp_path / "out").exists()
-    monkeypatch.setattr(sys, "argv", ["go1exp", "export", "check", file])
+    monkeypatch.setattr(sys, "argv", ["go1exp", "export", "check", bundle])
     assert cli.main() != 0
 
 
@@ -239,14 +212,14 @@ def test_the_motors_of_the_packets_are_the_joints_of_the_robot() -> None:
     assert (MOTOR_NAMES, len(MOTOR_NAMES)) == (robot.JOINTS, JOINTS)
 
 
-def test_a_robot_without_gains_is_refused(file: str, make_net: Callable[..., Path]) -> None:
-    task = bundle_task(file, {"actuator": {"term": "net", "file": str(make_net()), "period": "exact"}})
+def test_a_robot_without_gains_is_refused(bundle: str, make_net: Callable[..., Path]) -> None:
+    task = bundle_task(bundle, {"actuator": {"term": "net", "file": str(make_net()), "period": "exact"}})
     with pytest.raises(Exception, match=r"actuator = net: has no kp and kd, .*; use actuator=pd"):
         Robot(task, sim_config({}))
 
 
-def test_a_torque_that_is_fed_forward_moves_a_joint_until_nobody_speaks(file: str) -> None:
-    one = Robot(bundle_task(file, {}), sim_config({"start": "suspended", "noise": 0.0}))
+def test_a_torque_that_is_fed_forward_moves_a_joint_until_nobody_speaks(bundle: str) -> None:
+    one = Robot(bundle_task(bundle, {}), sim_config({"start": "suspended", "noise": 0.0}))
     limp = make_command(kp=np.zeros(12), kd=np.zeros(12))
     one.apply(dataclasses.replace(limp, feedforward=np.tile([0.0, 0.0, 5.0], 4)))
     before = one.sense()[0].joint_pos
@@ -266,14 +239,14 @@ def test_a_torque_that_is_fed_forward_moves_a_joint_until_nobody_speaks(file: st
 
 
 def play(
-    file: str, out: Path, spoil: Spoil = lambda state: state, *, job: dict[str, Any] | None = None, **plan: Any
+    bundle: str, out: Path, spoil: Spoil = lambda state: state, *, job: dict[str, Any] | None = None, **plan: Any
 ) -> SimpleNamespace:
     """Walk; return status, what was said, the account, the recording, the cycles and the world."""
     usual: dict[str, Any] = {"seconds": 1.0, "stand_up": 0.2, "lie_down": 0.0, "brake": 0.1}
     usual["command"] = CommandConfig((0.4, 0.0, 0.0))
     output: list[str] = []
     with lockstep(spoil) as world:
-        status = run_job(Job(file, "sim", Plan(**{**usual, **plan}), str(out), **(job or {})), output.append)
+        status = run_job(Job(bundle, "sim", Plan(**{**usual, **plan}), str(out), **(job or {})), output.append)
     (account,) = out.glob("*.json")
     kept = list(out.glob("*.parquet"))
     with np.load(next(out.glob("*.npz"))) as cycles:
@@ -288,19 +261,19 @@ def play(
     )
 
 
-def test_a_model_predictive_controller_walks_in_the_runtime(file: str, tmp_path: Path) -> None:
+def test_a_model_predictive_controller_walks_in_the_runtime(bundle: str, tmp_path: Path) -> None:
     mine = parse_controller(compose("deploy", ["controller=mpc", "bundle=walk.zip"])["controller"])
     assert isinstance(mine, MpcSettings)
     job = {"mover": Deployed(Mpc(mine)), "truth": True}
-    done = play(file, tmp_path, job=job, rate=1.0 / mine.period, seconds=2.0)
+    done = play(bundle, tmp_path, job=job, rate=1.0 / mine.period, seconds=2.0)
     assert done.output[-1] == "walked for 2.0 s, to the end"
     x, y, _ = done.account["velocity"]["mean"]
     assert (x, y) == (pytest.approx(0.4, abs=0.05), pytest.approx(0.0, abs=0.05))
     assert done.recording.meta.notes.endswith("feed-forward torques are not recorded")
 
 
-def test_a_walk_from_the_bundle_to_the_recording(file: str, tmp_path: Path) -> None:
-    done = play(file, tmp_path, job={"sim": {"noise": 0.0}, "truth": True})
+def test_a_walk_from_the_bundle_to_the_recording(bundle: str, tmp_path: Path) -> None:
+    done = play(bundle, tmp_path, job={"sim": {"noise": 0.0}, "truth": True})
     assert done.status == 0
     assert done.account["ended"] == "walked to the end"
     assert done.output[-1] == "walked for 1.0 s, to the end"
@@ -320,7 +293,7 @@ def test_a_walk_from_the_bundle_to_the_recording(file: str, tmp_path: Path) -> N
     )
     assert (r.meta.kp, r.meta.kd) == ((35.0,) * 12, (0.6875,) * 12)
     assert "torques have steps of 1/256 N m" in r.meta.notes
-    assert r.meta.contact == bundle_task(file, {}).contact == MUJOCO_CONTACT
+    assert r.meta.contact == bundle_task(bundle, {}).contact == MUJOCO_CONTACT
     assert r.meta.rate_hz == pytest.approx(500.0)
     assert len(r.t) == 600
     np.testing.assert_allclose(np.diff(r.t), TICK, atol=1e-9)
@@ -349,8 +322,8 @@ def test_a_walk_from_the_bundle_to_the_recording(file: str, tmp_path: Path) -> N
     assert done.world.applied[-1].damping
 
 
-def test_jitter_reorders_and_the_walk_goes_on(file: str, tmp_path: Path) -> None:
-    done = play(file, tmp_path, job={"sim": {"jitter": 0.005, "loss": 0.01}})
+def test_jitter_reorders_and_the_walk_goes_on(bundle: str, tmp_path: Path) -> None:
+    done = play(bundle, tmp_path, job={"sim": {"jitter": 0.005, "loss": 0.01}})
     assert done.status == 0
     link, r = done.account["link"], done.recording
     assert link["overtaken"] > 80  # states are 2 ms apart, and come up to 5 ms late
@@ -368,23 +341,23 @@ def test_jitter_reorders_and_the_walk_goes_on(file: str, tmp_path: Path) -> None
     assert any("relative to the fastest" in line for line in done.output)
 
 
-def test_the_log_is_fit_for_gap_and_says_nothing_of_what_it_does_not_know(file: str, tmp_path: Path) -> None:
-    done = play(file, tmp_path, job={"sim": {"noise": 0.1}, "other": {"effect": {"coulomb": {"bound": 0.4}}}})
+def test_the_log_is_fit_for_gap_and_says_nothing_of_what_it_does_not_know(bundle: str, tmp_path: Path) -> None:
+    done = play(bundle, tmp_path, job={"sim": {"noise": 0.1}, "other": {"effect": {"coulomb": {"bound": 0.4}}}})
     assert "coulomb" not in done.recording.meta.notes
     assert not any(name.startswith("base_") for name in done.recording.channels)
-    standing = suspended(bundle_task(file, {}).robot).suited([done.recording])
+    standing = suspended(bundle_task(bundle, {}).robot).suited([done.recording])
     assert standing.flaws(done.recording, audit(done.recording)) == []
 
 
-def test_the_same_walk_gives_the_same_numbers(file: str, tmp_path: Path) -> None:
-    one, two = (play(file, tmp_path / name, seconds=0.3, job={"sim": {"loss": 0.1}}) for name in ("a", "b"))
+def test_the_same_walk_gives_the_same_numbers(bundle: str, tmp_path: Path) -> None:
+    one, two = (play(bundle, tmp_path / name, seconds=0.3, job={"sim": {"loss": 0.1}}) for name in ("a", "b"))
     for name, values in one.recording.channels.items():
         assert values.tobytes() == two.recording.channels[name].tobytes(), name
     assert one.account["link"]["lost"] > 5
 
 
-def test_delay_and_loss_are_in_the_log_as_the_robot_lived_them(file: str, tmp_path: Path) -> None:
-    done = play(file, tmp_path, job={"sim": {"delay": 0.006, "loss": 0.05, "noise": 0.0}})
+def test_delay_and_loss_are_in_the_log_as_the_robot_lived_them(bundle: str, tmp_path: Path) -> None:
+    done = play(bundle, tmp_path, job={"sim": {"delay": 0.006, "loss": 0.05, "noise": 0.0}})
     assert done.status == 0
     assert done.account["link"]["lost"] > 5
     had = {round(clock / TICK): target for clock, target, _ in done.world.targets}
@@ -394,8 +367,8 @@ def test_delay_and_loss_are_in_the_log_as_the_robot_lived_them(file: str, tmp_pa
 
 
 @pytest.mark.parametrize("rate", [100.0, 200.0, 400.0])
-def test_another_rate_is_the_policys(file: str, tmp_path: Path, rate: float) -> None:
-    done = play(file, tmp_path, rate=rate, seconds=0.2)
+def test_another_rate_is_the_policys(bundle: str, tmp_path: Path, rate: float) -> None:
+    done = play(bundle, tmp_path, rate=rate, seconds=0.2)
     assert done.status == 0
     assert done.output[0] == f"note: the policy was trained at 50 Hz and runs at {rate:g} Hz"
     walking = done.cycles["phase"] == PHASES.index("walking")
@@ -403,8 +376,8 @@ def test_another_rate_is_the_policys(file: str, tmp_path: Path, rate: float) -> 
     assert len(np.unique(done.cycles["q_target"][walking], axis=0)) > 0.9 * walking.sum()
 
 
-def test_a_robot_gets_up_from_its_belly(file: str, tmp_path: Path) -> None:
-    done = play(file, tmp_path, stand_up=1.0, seconds=0.5, job={"sim": {"start": "lying"}, "truth": True})
+def test_a_robot_gets_up_from_its_belly(bundle: str, tmp_path: Path) -> None:
+    done = play(bundle, tmp_path, stand_up=1.0, seconds=0.5, job={"sim": {"start": "lying"}, "truth": True})
     assert done.status == 0
     height = done.recording.block("base_pos_z_w")[:, 0]
     assert height[0] < 0.1
@@ -425,9 +398,9 @@ def ended(done: SimpleNamespace) -> tuple[float, float, np.ndarray]:
     return float(place["base_pos_z_w"][-1]), float(down), place["base_pos_z_w"][braking]
 
 
-def test_a_walk_ends_with_lying_down(file: str, tmp_path: Path) -> None:
-    sinking = play(file, tmp_path / "a", seconds=0.5, brake=0.5)
-    lying = play(file, tmp_path / "b", seconds=0.5, brake=0.5, lie_down=2.0)
+def test_a_walk_ends_with_lying_down(bundle: str, tmp_path: Path) -> None:
+    sinking = play(bundle, tmp_path / "a", seconds=0.5, brake=0.5)
+    lying = play(bundle, tmp_path / "b", seconds=0.5, brake=0.5, lie_down=2.0)
     assert sinking.status == lying.status == 0
     assert lying.account["ended"] == sinking.account["ended"] == DONE
     assert lying.account["walked_s"] == pytest.approx(0.5)
@@ -459,9 +432,9 @@ def test_a_walk_ends_with_lying_down(file: str, tmp_path: Path) -> None:
     ],
 )
 def test_lying_down_is_no_shelter_from_faults(
-    file: str, tmp_path: Path, what: Callable[[LowState], LowState | None], name: str
+    bundle: str, tmp_path: Path, what: Callable[[LowState], LowState | None], name: str
 ) -> None:
-    done = play(file, tmp_path, from_(1.0, what), seconds=0.5, lie_down=2.0)
+    done = play(bundle, tmp_path, from_(1.0, what), seconds=0.5, lie_down=2.0)
     assert done.status == STATUS[name]
     assert done.account["ended"] == name
     assert 0.99 < done.account["fault"]["t"] - BEGIN < 1.1
@@ -473,7 +446,7 @@ def test_lying_down_is_no_shelter_from_faults(
 
 @pytest.mark.parametrize(("keys", "lie_down", "status"), [(1, 1.0, 0), (2, 1.0, 20), (1, 0.0, 20)])
 def test_a_key_ends_a_walk_in_order_and_twice_at_once(
-    file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, keys: int, lie_down: float, status: int
+    bundle: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, keys: int, lie_down: float, status: int
 ) -> None:
     ours, theirs = pty.openpty()
     left = [0.5 + 0.3 * k for k in range(keys)]
@@ -486,7 +459,7 @@ def test_a_key_ends_a_walk_in_order_and_twice_at_once(
 
     with os.fdopen(theirs, "rb", buffering=0) as terminal:
         monkeypatch.setattr(sys, "stdin", terminal)
-        done = play(file, tmp_path, pressed, seconds=None, lie_down=lie_down, command=CommandConfig("keyboard"))
+        done = play(bundle, tmp_path, pressed, seconds=None, lie_down=lie_down, command=CommandConfig("keyboard"))
     os.close(ours)
     assert done.status == status
     assert ("lying_down" in done.account["phases"]) == (lie_down > 0)
@@ -536,10 +509,10 @@ FAULTY: list[tuple[str, Callable[[LowState], LowState | None], str]] = [
 
 @pytest.mark.parametrize(("name", "what", "message"), FAULTY, ids=[f"{k} {f[0]}" for k, f in enumerate(FAULTY)])
 def test_a_fault_over_the_link_makes_the_drives_brake_and_has_a_name_in_the_log(
-    file: str, tmp_path: Path, name: str, what: Callable[[LowState], LowState | None], message: str
+    bundle: str, tmp_path: Path, name: str, what: Callable[[LowState], LowState | None], message: str
 ) -> None:
     handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    done = play(file, tmp_path, from_(0.5, what), seconds=2.0)
+    done = play(bundle, tmp_path, from_(0.5, what), seconds=2.0)
     assert done.status == STATUS[name]
     assert done.account["ended"] == name
     assert message in done.account["fault"]["message"]
@@ -553,15 +526,15 @@ def test_a_fault_over_the_link_makes_the_drives_brake_and_has_a_name_in_the_log(
     assert handlers == [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
 
 
-def test_a_robot_that_never_speaks_is_waited_for_and_not_commanded(file: str, tmp_path: Path) -> None:
-    done = play(file, tmp_path, lambda state: None, patience=0.3)
+def test_a_robot_that_never_speaks_is_waited_for_and_not_commanded(bundle: str, tmp_path: Path) -> None:
+    done = play(bundle, tmp_path, lambda state: None, patience=0.3)
     assert done.status == STATUS["no_state"]
     assert done.recording is None
     assert done.account["fault"]["t"] - BEGIN == pytest.approx(0.3, abs=0.03)
     assert done.account["first_command_after_s"] is None or done.world.applied
 
 
-def test_a_link_that_breaks_ends_the_walk_with_a_log(file: str) -> None:
+def test_a_link_that_breaks_ends_the_walk_with_a_log(bundle: str) -> None:
     sent: list[LowCmd] = []
     calls = iter(range(100))
 
@@ -576,7 +549,7 @@ def test_a_link_that_breaks_ends_the_walk_with_a_log(file: str) -> None:
         sent_at=math.nan, receive=receive, send=sent.append, repeat=nothing, rehearse=nothing, close=nothing
     )
     outcome = walk.walk(
-        load(file), cast(Link, link), Plan(rate=500.0, stale=BUSY, stand_up=0.004, seconds=5.0, spin=0.0)
+        load(bundle), cast(Link, link), Plan(rate=500.0, stale=BUSY, stand_up=0.004, seconds=5.0, spin=0.0)
     )
     assert outcome.fault is not None
     assert (outcome.fault.name, outcome.fault.message) == ("runtime", "RobotError: the SDK failed")
@@ -597,8 +570,8 @@ def test_every_fault_has_a_status_of_its_own() -> None:
 # ---------------------------------------------------------------------- estimate
 
 
-def test_the_filters_settings_travel_in_the_bundle(file: str) -> None:
-    about = load(file).metadata
+def test_the_filters_settings_travel_in_the_bundle(bundle: str) -> None:
+    about = load(bundle).metadata
     assert settings(about.estimator) == go1() == settings({})
     assert settings(about.estimator, contact_source="height").contact_source == "height"
     changed = {**about.estimator, "gate": 9.0}
@@ -790,8 +763,8 @@ def cycle(t: float, phase: str, fresh: list[LowState], target: float | None = 0.
     return Cycle(t, phase, fresh[-1] if fresh else None, command, np.zeros(3), np.zeros(3), None, fresh)
 
 
-def test_a_robot_that_does_not_report_the_applied_command_is_taken_to_apply_the_newest(file: str) -> None:
-    about = load(file).metadata
+def test_a_robot_that_does_not_report_the_applied_command_is_taken_to_apply_the_newest(bundle: str) -> None:
+    about = load(bundle).metadata
     log = Log(100.0, 1.0)
     silent = {"clock": math.nan}
     steps = [(0.0, "waiting", None), (0.01, "walking", 1.0), (0.02, "walking", 2.0), (0.03, "damping", 0.0)]
@@ -818,20 +791,20 @@ def test_a_robot_that_does_not_report_the_applied_command_is_taken_to_apply_the_
     ],
 )
 def test_a_log_names_the_contact_that_its_policy_was_trained_with(
-    file: str, config: dict[str, Any], contact: tuple[Any, ...] | None
+    bundle: str, config: dict[str, Any], contact: tuple[Any, ...] | None
 ) -> None:
     log = Log(100.0, 1.0)
     for t, phase in ((0.0, "walking"), (0.01, "walking"), (0.02, "damping")):
         log.note(cycle(t, phase, [make_state(t - k, clock=math.nan) for k in (0.006, 0.002)]))
     twelve = np.full(12, 20.0)
-    about = About(load(file).metadata, twelve, twelve, simulated=False, newton=False, episode="e", trained=config)
+    about = About(load(bundle).metadata, twelve, twelve, simulated=False, newton=False, episode="e", trained=config)
     recording = log.recording(about)
     assert recording is not None
     assert recording.meta.contact == (None if contact is None else ContactConfig(*contact))
 
 
-def test_a_long_walk_keeps_its_newest_seconds(file: str, tmp_path: Path) -> None:
-    done = play(file, tmp_path, keep=0.5, seconds=0.8)
+def test_a_long_walk_keeps_its_newest_seconds(bundle: str, tmp_path: Path) -> None:
+    done = play(bundle, tmp_path, keep=0.5, seconds=0.8)
     assert done.account["log"]["overwritten"] > 100
     assert 200 <= len(done.recording.t) <= 251
     assert done.recording.t[-1] == pytest.approx(1.03, abs=0.03)
@@ -844,11 +817,11 @@ def test_a_long_walk_keeps_its_newest_seconds(file: str, tmp_path: Path) -> None
 
 @pytest.mark.slow("go1exp/deploy/", "go1exp/deploy/sim_robot/", "go1exp/cli/", "go1exp/deploy/export/")
 def test_the_verb_walks_against_another_process_in_real_time(
-    file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    bundle: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(data_root()))
-    arguments = ["deploy", file, "robot=sim", "command=[0.3,0,0]", "seconds=1.5", "stand_up=0.5", "brake=0.2"]
+    arguments = ["deploy", bundle, "robot=sim", "command=[0.3,0,0]", "seconds=1.5", "stand_up=0.5", "brake=0.2"]
     monkeypatch.setattr(sys, "argv", ["go1exp", *arguments, f"stale={BUSY}", "effect=payload", "out=logs"])
     assert cli.main() == 0
     output = capsys.readouterr().out
@@ -878,14 +851,14 @@ def begun(folder: Path, *arguments: str) -> tuple[subprocess.Popen[str], IO[str]
 
 
 @pytest.mark.slow("go1exp/deploy/", "go1exp/deploy/sim_robot/", "go1exp/cli/", "go1exp/deploy/export/")
-def test_the_light_way_stops_at_a_signal_and_loads_nothing_heavy(file: str, tmp_path: Path) -> None:
+def test_the_light_way_stops_at_a_signal_and_loads_nothing_heavy(bundle: str, tmp_path: Path) -> None:
     code = (
         "import sys, json\nfrom go1exp.deploy.__main__ import main\nstatus = main(sys.argv[1:])\n"
         "with open('modules.json', 'w') as file:\n"
         "    json.dump(sorted({name.split('.')[0] for name in sys.modules}), file)\nsys.exit(status)"
     )
     arguments = [
-        file,
+        bundle,
         "--command",
         "0.2,0,0",
         "--stand-up",
@@ -924,9 +897,9 @@ def children(pid: int) -> list[int]:
 @pytest.mark.parametrize("way", ["go1exp.deploy", "go1exp"])
 @pytest.mark.parametrize("seconds", [60.0, pytest.param(2.0, marks=pytest.mark.slow("go1exp/deploy/", "go1exp/cli/"))])
 def test_a_signal_while_the_robot_starts_ends_both_at_once(
-    file: str, tmp_path: Path, seconds: float, way: str, number: signal.Signals
+    bundle: str, tmp_path: Path, seconds: float, way: str, number: signal.Signals
 ) -> None:
-    arguments = ["deploy", file, "out=logs"] if way == "go1exp" else [file, "--out", "logs"]
+    arguments = ["deploy", bundle, "out=logs"] if way == "go1exp" else [bundle, "--out", "logs"]
     process, pipe = begun(tmp_path, "-m", way, *arguments)
     lines = [next(pipe)]
     while "starting the simulated robot" not in lines[-1]:
@@ -949,23 +922,23 @@ def test_a_signal_while_the_robot_starts_ends_both_at_once(
     assert list(tmp_path.rglob("walk_*")) == []
 
 
-def test_what_is_wrong_is_said_in_a_line(file: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_what_is_wrong_is_said_in_a_line(bundle: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     from go1exp.deploy.__main__ import main
 
     assert main([str(tmp_path / "none.zip")]) == 1
     assert "No such file" in capfd.readouterr().err
-    assert main([file, "--command", "fast", "--out", str(tmp_path)]) == 1
+    assert main([bundle, "--command", "fast", "--out", str(tmp_path)]) == 1
     assert capfd.readouterr().err.startswith("go1exp.deploy: command 'fast': must be three numbers")
-    assert main([file, "--robot", "dog", "--out", str(tmp_path)]) == 1
+    assert main([bundle, "--robot", "dog", "--out", str(tmp_path)]) == 1
     assert "robot=dog: must be sim, go1, or the port" in capfd.readouterr().err
     with pytest.raises(SystemExit):
-        main([file, "--rate", "-5"])
+        main([bundle, "--rate", "-5"])
     assert "-5: must be greater than 0" in capfd.readouterr().err
     with pytest.raises(RefusedError, match=r"sim\.loss = 2"):
-        run_job(Job(file, "sim", Plan(), str(tmp_path), sim={"loss": 2.0}), print)
+        run_job(Job(bundle, "sim", Plan(), str(tmp_path), sim={"loss": 2.0}), print)
     output: list[str] = []
     with pytest.raises(NotADirectoryError):  # before the robot is started, not when the log is due
-        run_job(Job(file, "sim", Plan(), f"{file}/logs"), output.append)
+        run_job(Job(bundle, "sim", Plan(), f"{bundle}/logs"), output.append)
     assert output == []
     assert list(tmp_path.iterdir()) == []
 
@@ -984,10 +957,10 @@ def test_the_bench_measures_the_runtime(monkeypatch: pytest.MonkeyPatch) -> None
     assert 20 < figures["memory_mb"] < 400
 
 
-def test_a_motion_of_a_hung_robot_becomes_a_recording_for_gap(file: str, tmp_path: Path) -> None:
+def test_a_motion_of_a_hung_robot_becomes_a_recording_for_gap(bundle: str, tmp_path: Path) -> None:
     motion = played("chirp", 1.0, 250.0, (35.0, 0.7), 3)
     job = {"mover": motion, "motion": motion.name, "gains": motion.gains, "sim": {"start": "suspended", "noise": 0.0}}
-    done = play(file, tmp_path, job=job, rate=motion.rate, seconds=motion.seconds)
+    done = play(bundle, tmp_path, job=job, rate=motion.rate, seconds=motion.seconds)
     assert done.output[-1] == f"walked for {motion.seconds:.1f} s, to the end"
     meta = done.recording.meta
     assert (meta.base, meta.excitation, meta.kp[0], meta.kd[0]) == ("fixed", "chirp", 35.0, 0.6875)

@@ -21,23 +21,11 @@ from go1exp.deploy.runtime.loop import Deadlines, MonotonicClock, Timing, run
 from go1exp.deploy.runtime.metadata import Port
 from go1exp.deploy.runtime.safety import RULES, Safety, SafetyConfig, sdk_range, tilt_angle
 from go1exp.robot.messages import LowCmd, LowState
+from tests.made import low_state
 
 NOMINAL = robot.NOMINAL_STANCE
 LIMIT = robot.per_joint(robot.EFFORT_LIMIT)
 KP, KD = np.full(12, 20.0), np.full(12, 0.5)
-
-
-def make_state(t: float = 0.0, **changes: Any) -> LowState:
-    usual: dict[str, Any] = {
-        "joint_pos": NOMINAL.copy(),
-        "joint_vel": np.zeros(12),
-        "joint_torque": np.zeros(12),
-        "imu_quat": np.array([1.0, 0.0, 0.0, 0.0]),
-        "imu_gyro": np.zeros(3),
-        "imu_acc": np.array([0.0, 0.0, 9.81]),
-        "foot_force": np.full(4, 30.0),
-    }
-    return LowState(t, **{**usual, **changes})
 
 
 def make_command(**changes: Any) -> LowCmd:
@@ -60,48 +48,48 @@ def leaning(angle: float, axis: Sequence[float] = (0.6, 0.8, 0.0)) -> np.ndarray
 
 # ---------------------------------------------------------------------- faults
 
-SOUND = make_state()
+SOUND = low_state()
 JUST_RIGHT: dict[str, tuple[LowState, LowCmd, float]] = {
-    "stale_state": (make_state(0.0), make_command(), 0.0299),
-    "not_finite": (make_state(joint_vel=np.full(12, 20.0)), make_command(), 0.0),
-    "attitude": (make_state(imu_quat=np.array([1.049, 0, 0, 0])), make_command(), 0.0),
-    "tilt": (make_state(imu_quat=leaning(0.999)), make_command(), 0.0),
-    "joint_range": (make_state(joint_pos=at(NOMINAL, 0, 0.863 + 0.086)), make_command(), 0.0),
-    "torque": (make_state(joint_torque=at(np.zeros(12), 5, -1.19 * 35.55)), make_command(), 0.0),
-    "power": (make_state(joint_torque=np.full(12, 20.0), joint_vel=np.full(12, 499 / 240)), make_command(), 0.0),
+    "stale_state": (low_state(0.0), make_command(), 0.0299),
+    "not_finite": (low_state(joint_vel=np.full(12, 20.0)), make_command(), 0.0),
+    "attitude": (low_state(imu_quat=np.array([1.049, 0, 0, 0])), make_command(), 0.0),
+    "tilt": (low_state(imu_quat=leaning(0.999)), make_command(), 0.0),
+    "joint_range": (low_state(joint_pos=at(NOMINAL, 0, 0.863 + 0.086)), make_command(), 0.0),
+    "torque": (low_state(joint_torque=at(np.zeros(12), 5, -1.19 * 35.55)), make_command(), 0.0),
+    "power": (low_state(joint_torque=np.full(12, 20.0), joint_vel=np.full(12, 499 / 240)), make_command(), 0.0),
 }
 FAULTS: dict[str, list[tuple[LowState, LowCmd, float, str]]] = {
-    "stale_state": [(make_state(0.0), make_command(), 0.0301, "the newest state is 30 ms old")],
+    "stale_state": [(low_state(0.0), make_command(), 0.0301, "the newest state is 30 ms old")],
     "not_finite": [
-        (make_state(0.0, **{name: at(getattr(SOUND, name), 2, value)}), make_command(), 0.0, f"{name} of")
+        (low_state(0.0, **{name: at(getattr(SOUND, name), 2, value)}), make_command(), 0.0, f"{name} of")
         for name in ("joint_pos", "joint_vel", "joint_torque", "imu_quat", "imu_gyro", "imu_acc")
         for value in (np.nan, np.inf)
     ]
     + [
-        (make_state(), make_command(**{name: at(NOMINAL, 4, np.nan)}), 0.0, f"{name} of FL_thigh is nan")
+        (low_state(), make_command(**{name: at(NOMINAL, 4, np.nan)}), 0.0, f"{name} of FL_thigh is nan")
         for name in ("joint_target", "kp", "kd")
     ],
     "attitude": [
-        (make_state(imu_quat=np.zeros(4)), make_command(), 0.0, "length is 0.000 instead of 1"),
-        (make_state(imu_quat=np.array([1.06, 0, 0, 0])), make_command(), 0.0, "length is 1.060"),
+        (low_state(imu_quat=np.zeros(4)), make_command(), 0.0, "length is 0.000 instead of 1"),
+        (low_state(imu_quat=np.array([1.06, 0, 0, 0])), make_command(), 0.0, "length is 1.060"),
     ],
     "tilt": [
-        (make_state(imu_quat=leaning(1.01, axis)), make_command(), 0.0, "tilt 58 deg, the limit is 57 deg")
+        (low_state(imu_quat=leaning(1.01, axis)), make_command(), 0.0, "tilt 58 deg, the limit is 57 deg")
         for axis in ((1, 0, 0), (0, 1, 0), (0, -1, 0), (0.6, -0.8, 0))
     ]
-    + [(make_state(imu_quat=leaning(math.pi)), make_command(), 0.0, "tilt 180 deg")],
+    + [(low_state(imu_quat=leaning(math.pi)), make_command(), 0.0, "tilt 180 deg")],
     "joint_range": [
-        (make_state(joint_pos=at(NOMINAL, 0, 0.863 + 0.088)), make_command(), 0.0, "FR_hip is at 0.951 rad, 0.088"),
-        (make_state(joint_pos=at(NOMINAL, 11, -2.818 - 0.1)), make_command(), 0.0, "RL_calf is at -2.918 rad, 0.100"),
+        (low_state(joint_pos=at(NOMINAL, 0, 0.863 + 0.088)), make_command(), 0.0, "FR_hip is at 0.951 rad, 0.088"),
+        (low_state(joint_pos=at(NOMINAL, 11, -2.818 - 0.1)), make_command(), 0.0, "RL_calf is at -2.918 rad, 0.100"),
     ],
     "torque": [
-        (make_state(joint_torque=at(np.zeros(12), 5, -1.21 * 35.55)), make_command(), 0.0, "FL_calf reports -43.0 N m")
+        (low_state(joint_torque=at(np.zeros(12), 5, -1.21 * 35.55)), make_command(), 0.0, "FL_calf reports -43.0 N m")
     ],
     "power": [
-        (make_state(joint_torque=np.full(12, 20.0), joint_vel=np.full(12, 501 / 240)), make_command(), 0.0, "501 W"),
+        (low_state(joint_torque=np.full(12, 20.0), joint_vel=np.full(12, 501 / 240)), make_command(), 0.0, "501 W"),
         # A joint that brakes does not make good for one that drives.
         (
-            make_state(joint_torque=np.array([20.0, -20.0] * 6), joint_vel=np.full(12, 2.1)),
+            low_state(joint_torque=np.array([20.0, -20.0] * 6), joint_vel=np.full(12, 2.1)),
             *(make_command(), 0.0, "power is 504 W, the limit is 500 W"),
         ),
     ],
@@ -127,7 +115,7 @@ def test_a_fault_is_named_and_the_drives_brake_from_then_on(
     assert safety.fault is not None
     assert (safety.fault.name, safety.fault.t) == (name, now)
     assert message in safety.fault.message
-    for later in (sent, safety.review(make_state(now), make_command(), now)):
+    for later in (sent, safety.review(low_state(now), make_command(), now)):
         assert later.damping
         assert (later.kp == 0).all()
         assert (later.kd == SafetyConfig().damping_kd).all()
@@ -151,9 +139,9 @@ def test_every_rule_is_tried() -> None:
 
 def test_a_stop_acts_in_the_next_cycle_and_comes_first() -> None:
     safety = make_safety()
-    assert not safety.review(make_state(), make_command(), 0.0).damping
+    assert not safety.review(low_state(), make_command(), 0.0).damping
     safety.stop("SIGINT")
-    assert safety.review(make_state(imu_quat=np.zeros(4)), make_command(), 1.0).damping
+    assert safety.review(low_state(imu_quat=np.zeros(4)), make_command(), 1.0).damping
     assert str(safety.fault) == "operator_stop at 1.000 s: requested by SIGINT"
 
 
@@ -164,10 +152,10 @@ def test_a_spike_is_forgiven_and_a_burst_is_not(name: str) -> None:
     alternating, mostly = make_safety(), make_safety()
     for _ in range(100):
         alternating.review(bad, command, now)
-        alternating.review(make_state(), command, now)
+        alternating.review(low_state(), command, now)
     assert alternating.fault is None
     for k in range(100):
-        mostly.review(make_state() if k % 3 == 2 else bad, command, now)
+        mostly.review(low_state() if k % 3 == 2 else bad, command, now)
     assert mostly.fault is not None
     assert mostly.fault.name == name
 
@@ -176,7 +164,7 @@ def test_before_the_first_state_and_without_a_command_the_drives_brake() -> None
     safety = make_safety()
     assert safety.review(None, None, 5.0).damping
     assert safety.review(None, make_command(), 5.0).damping
-    assert safety.review(make_state(), None, 0.0).damping
+    assert safety.review(low_state(), None, 0.0).damping
     assert safety.fault is None
 
 
@@ -184,7 +172,7 @@ def test_a_fault_found_elsewhere_counts_too_and_the_first_stays() -> None:
     safety = make_safety()
     safety.fail("estimator", "diverged", 1.0)
     safety.fail("command", "late", 2.0)
-    assert safety.review(make_state(), make_command(), 2.0).damping
+    assert safety.review(low_state(), make_command(), 2.0).damping
     assert str(safety.fault) == "estimator at 1.000 s: diverged"
 
 
@@ -205,7 +193,7 @@ def test_targets_are_cut_to_the_sdks_range_and_the_stops() -> None:
     assert sdk_range(robot.JOINTS).tolist() == [[-1.047, 1.047], [-0.663, 2.966], [-2.721, -0.837]] * 4
     safety = make_safety()
     for ask, expected in ((9.0, [0.863, 2.966, -0.888]), (-9.0, [-0.863, -0.663, -2.721])):
-        near = make_state(joint_pos=np.tile(expected, 4))  # so that the torque limit does not act
+        near = low_state(joint_pos=np.tile(expected, 4))  # so that the torque limit does not act
         sent = safety.review(near, make_command(joint_target=np.full(12, ask)), 0.0)
         np.testing.assert_allclose(sent.joint_target, np.tile(expected, 4), atol=1e-12)
         assert not sent.damping
@@ -218,7 +206,7 @@ def test_targets_are_cut_to_the_peak_torque() -> None:
         q = rng.uniform(*robot.JOINT_POS_LIMITS.T)
         qd = rng.uniform(-5, 5, 12)
         command = make_command(joint_target=rng.uniform(-3, 3, 12), kp=np.full(12, 60.0))
-        sent = safety.limited(make_state(joint_pos=q, joint_vel=qd), command)
+        sent = safety.limited(low_state(joint_pos=q, joint_vel=qd), command)
         torque = 60.0 * (sent.joint_target - q) - 0.5 * qd
         inside = (sent.joint_target > safety._low) & (sent.joint_target < safety._high)
         assert (np.abs(torque)[inside] <= LIMIT[inside] + 1e-9).all()
@@ -233,24 +221,24 @@ def test_targets_are_cut_to_the_peak_torque() -> None:
 def test_torque_that_is_fed_forward_is_cut_too_and_counts_in_what_targets_need() -> None:
     safety = make_safety()
     fed = np.full(12, 100.0)
-    sent = safety.review(make_state(), make_command(kp=np.zeros(12), feedforward=fed), 0.0)
+    sent = safety.review(low_state(), make_command(kp=np.zeros(12), feedforward=fed), 0.0)
     assert sent.feedforward is not None
     np.testing.assert_allclose(sent.feedforward, LIMIT)
     for torque, ask in ((10.0, 0.5), (10.0, -0.3), (-20.0, -0.5), (0.0, 0.1)):
         command = make_command(joint_target=NOMINAL + ask, feedforward=np.full(12, torque))
-        sent = safety.review(make_state(), command, 0.0)
+        sent = safety.review(low_state(), command, 0.0)
         asked = np.clip(KP * ask + torque, -LIMIT, LIMIT)
         inside = (sent.joint_target > safety._low) & (sent.joint_target < safety._high)
         found = KP * (sent.joint_target - NOMINAL) + torque
         np.testing.assert_allclose(found[inside], asked[inside], atol=1e-9)
     spoilt = make_command(feedforward=at(np.zeros(12), 4, np.nan))
-    assert safety.review(make_state(), spoilt, 0.0).damping
+    assert safety.review(low_state(), spoilt, 0.0).damping
     assert safety.fault is not None
     assert safety.fault.message == "feedforward of FL_thigh is nan"
 
 
 def test_a_command_without_position_gain_is_not_divided_by() -> None:
-    sent = make_safety().review(make_state(), make_command(kp=np.zeros(12)), 0.0)
+    sent = make_safety().review(low_state(), make_command(kp=np.zeros(12)), 0.0)
     assert (sent.joint_target == NOMINAL).all()
 
 
@@ -317,7 +305,7 @@ class Velocity:
 
 def always(cycle: int) -> Sequence[LowState]:
     """Five states in each cycle of 10 ms."""
-    return [make_state(0.01 * cycle - 0.002 * k) for k in (4, 3, 2, 1, 0)]
+    return [low_state(0.01 * cycle - 0.002 * k) for k in (4, 3, 2, 1, 0)]
 
 
 def controller(
@@ -346,7 +334,7 @@ def test_a_robot_stands_up_and_then_walks() -> None:
     lying = at(NOMINAL, 1, 1.8)
 
     def script(cycle: int) -> Sequence[LowState]:
-        return [make_state(0.01 * cycle, joint_pos=lying)] if cycle >= 3 else []
+        return [low_state(0.01 * cycle, joint_pos=lying)] if cycle >= 3 else []
 
     made = controller(script)
     assert all(made.run_cycles(30))
@@ -429,8 +417,8 @@ def test_what_fails_before_a_cycle_is_a_fault_in_it() -> None:
 
 def test_the_reach_of_a_target_follows_the_gains() -> None:
     safety, far = make_safety(), make_command(joint_target=at(NOMINAL, 0, NOMINAL[0] + 9.0))
-    fresh = [make_safety().review(make_state(), dataclasses.replace(far, kp=f * KP), 0.0) for f in (1, 50)]
-    kept = [safety.review(make_state(), dataclasses.replace(far, kp=f * KP), 0.0) for f in (1, 50, 1)]
+    fresh = [make_safety().review(low_state(), dataclasses.replace(far, kp=f * KP), 0.0) for f in (1, 50)]
+    kept = [safety.review(low_state(), dataclasses.replace(far, kp=f * KP), 0.0) for f in (1, 50, 1)]
     assert [k.joint_target[0] for k in kept[:2]] == [f.joint_target[0] for f in fresh]
     assert kept[2].joint_target[0] == kept[0].joint_target[0] != kept[1].joint_target[0]
 
@@ -447,7 +435,7 @@ def silent_after(cycle: int) -> Callable[[int], Sequence[LowState]]:
 
 
 def odd_from(cycle: int, **changes: Any) -> Callable[[int], Sequence[LowState]]:
-    return lambda k: [make_state(0.01 * k, **changes)] if k >= cycle else always(k)
+    return lambda k: [low_state(0.01 * k, **changes)] if k >= cycle else always(k)
 
 
 @pytest.mark.parametrize(

@@ -41,10 +41,10 @@ from go1exp.mdp.types import Snapshot
 from go1exp.robot.messages import Link, LowCmd, LowState
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import ActionConfig, TaskConfig, parse_task, parse_train
-from go1exp.train import run_folder, trainer
+from go1exp.train import run_folder
 from go1exp.train.policy import load_policy
 from go1exp.train.ppo import GaussianPolicy
-from tests.small_run import SMALL
+from tests.small_run import trained
 
 OBSERVATIONS = sorted(p.stem for p in (data_root() / "conf/observation").glob("*.yaml"))
 ROWS = 1000
@@ -53,11 +53,8 @@ ROWS = 1000
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of two tiny iterations, with settings that are not the usual ones."""
-    run = tmp_path_factory.mktemp("export") / "run"
-    container = compose("train", (*SMALL, "action.scale=0.3", "actuator.kp=[25,30,35]", "actuator.kd=0.7"))
-    run_folder.write(run, container)
-    trainer.train(parse_train(container), container, run)
-    return run
+    changes = ("action.scale=0.3", "actuator.kp=[25,30,35]", "actuator.kd=0.7")
+    return trained(tmp_path_factory.mktemp("export") / "run", *changes)
 
 
 @pytest.fixture(scope="module")

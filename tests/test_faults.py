@@ -8,7 +8,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,32 +18,24 @@ import torch
 from torch import Tensor
 
 from go1exp.base import files
-from go1exp.config.compose import compose
 from go1exp.config.schema import registry
 from go1exp.config.schema.registry import Expected
 from go1exp.mdp.types import Snapshot, StepResult
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.faults import NumericalFault
-from go1exp.sim.task import TrainConfig, parse_train
+from go1exp.sim.task import TrainConfig
 from go1exp.train import checkpoint, run_folder, trainer
 from go1exp.train.group import Group
 from go1exp.train.metrics import CsvWriter
 from go1exp.train.ppo import AdaptivePPO
 from tests.command import run as cli
-from tests.small_run import small
+from tests.small_run import small, train
 
 SMALL = small(
     *("ppo=paper", "checkpoint.every=1", "sim.spread_starts=false"), num_envs=8, steps=8, epochs=2, iterations=4
 )
 FULL = Path("/dev/full")
 needs_full = pytest.mark.skipif(not FULL.exists(), reason="/dev/full, a disk without space, is Linux's")
-
-
-def train_here(run: Path, overrides: Sequence[str] = SMALL) -> AdaptivePPO:
-    container = compose("train", overrides)
-    config = parse_train(container)
-    run_folder.write(run, container)
-    return trainer.train(config, container, run)
 
 
 @pytest.fixture
@@ -102,7 +94,7 @@ def test_broken_physics_stop_training_with_the_quantity_and_the_robot(
 
     break_step(monkeypatch, 2 * 8 + 4, damage)
     with pytest.raises(NumericalFault, match="is not finite in environment 2 at step 20") as caught:
-        train_here(run)
+        train(run, SMALL)
     assert caught.value.quantity in quantities
     assert str(caught.value).startswith(caught.value.quantity)
     arrays = assert_dumped(run, caught.value)
@@ -119,12 +111,12 @@ def test_after_a_fault_the_run_goes_on_from_its_checkpoint_as_if_nothing_had_bee
     def damage(core: Go1Core) -> None:
         core.backend.qpos[1] = math.nan
 
-    train_here(tmp_path / "reference")
+    train(tmp_path / "reference", SMALL)
     with monkeypatch.context() as patch:
         break_step(patch, 3 * 8 + 1, damage)
         with pytest.raises(NumericalFault):
-            train_here(run)
-    train_here(run)
+            train(run, SMALL)
+    train(run, SMALL)
     assert_saved_up_to(run, 4)
     assert (run / "metrics.csv").read_bytes() == (tmp_path / "reference/metrics.csv").read_bytes()
 
@@ -146,7 +138,7 @@ def odd_reward() -> Iterator[str]:
 
 def test_a_reward_that_is_not_finite_is_named_by_its_key(odd_reward: str, run: Path) -> None:
     with pytest.raises(NumericalFault) as caught:
-        train_here(run, [*SMALL, odd_reward, "termination=none"])
+        train(run, [*SMALL, odd_reward, "termination=none"])
     assert str(caught.value) == "reward.odd_one is not finite in environment 5 at step 20"
     arrays = assert_dumped(run, caught.value)
     assert [name for name, array in arrays.items() if not np.isfinite(array).all()] == ["reward.odd_one"]
@@ -181,7 +173,7 @@ def test_a_gradient_that_is_not_finite_is_named_by_its_parameter_before_it_does_
 ) -> None:
     break_gradient(monkeypatch, name, value, 2 * 4 + 3)  # four gradient steps an iteration
     with pytest.raises(NumericalFault, match="in iteration 3") as caught:
-        train_here(run)
+        train(run, SMALL)
     assert_dumped(run, caught.value)
     assert_saved_up_to(run, 2)
     named = caught.value.quantity
@@ -231,7 +223,7 @@ def test_a_file_in_the_place_of_the_checkpoints_is_named(run: Path) -> None:
     run.mkdir()
     (run / "checkpoints").write_text("mine")
     with pytest.raises(OSError, match="checkpoints"):
-        train_here(run)
+        train(run, SMALL)
 
 
 @needs_full
@@ -249,7 +241,7 @@ def test_a_full_disk_is_reported_with_the_checkpoint_and_costs_none_of_the_other
 
     monkeypatch.setattr(files, "_beside", on_full_device)
     with pytest.raises(OSError, match="No space left on device") as caught:
-        train_here(run)
+        train(run, SMALL)
     assert caught.value.errno == errno.ENOSPC
     state, path = checkpoint.load_latest(run)
     assert (state["iteration"], path.name) == (2, "000002.pt")
@@ -260,7 +252,7 @@ def test_a_full_disk_is_reported_with_the_checkpoint_and_costs_none_of_the_other
 def test_a_save_that_fails_half_way_costs_nothing_and_can_be_made_up_for(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    train_here(tmp_path / "reference")
+    train(tmp_path / "reference", SMALL)
     save = torch.save
 
     def half(state: dict[str, object], file: object) -> None:
@@ -272,9 +264,9 @@ def test_a_save_that_fails_half_way_costs_nothing_and_can_be_made_up_for(
     with monkeypatch.context() as patch:
         patch.setattr(torch, "save", half)
         with pytest.raises(OSError, match="No space left on device"):
-            train_here(run)
+            train(run, SMALL)
     assert checkpoint.load_latest(run)[1].name == "000002.pt"
-    train_here(run)
+    train(run, SMALL)
     assert_saved_up_to(run, 4)
     assert not list((run / "checkpoints").glob("*.partial"))
     assert (run / "metrics.csv").read_bytes() == (tmp_path / "reference/metrics.csv").read_bytes()
@@ -294,7 +286,7 @@ def test_a_disk_that_fills_up_within_a_checkpoint_is_named_as_the_cause(
 
     monkeypatch.setattr(torch, "save", lambda state, file: save(state, NearlyFull()))
     with pytest.raises(OSError, match="No space left on device") as caught:
-        train_here(run)
+        train(run, SMALL)
     assert caught.value.errno == errno.ENOSPC
     assert not checkpoint.checkpoints(run)
 
@@ -317,4 +309,4 @@ def test_a_full_disk_is_reported_with_the_metrics_file(tmp_path: Path) -> None:
 def test_a_folder_in_the_place_of_the_metrics_file_is_named(run: Path) -> None:
     (run / "metrics.csv").mkdir(parents=True)
     with pytest.raises(OSError, match=r"metrics\.csv"):
-        train_here(run)
+        train(run, SMALL)

@@ -21,6 +21,7 @@ from go1exp.gap.actuator_net.report import text
 from go1exp.gap.actuator_net.settings import FitError, FitSettings
 from go1exp.logs.recording import Meta, Recording, RecordingError, problems
 from go1exp.sim.actuator.actuator_net import ActuatorNet, InputName, NetFileError, load
+from tests import made
 
 JOINTS = ("FR_hip", "FR_calf")
 KP, KD = 20.0, 0.5
@@ -29,24 +30,8 @@ LAG, LIMIT = 0.015, 8.0
 
 
 def meta(episode: str, **changes: Any) -> Meta:
-    usual: dict[str, Any] = {
-        "robot": "go1",
-        "joints": JOINTS,
-        "rate_hz": 200.0,
-        "base": "fixed",
-        "base_quat": (1.0, 0.0, 0.0, 0.0),
-        "kp": (KP,) * 2,
-        "kd": (KD,) * 2,
-        "tau_limit": None,
-        "excitation": None,
-        "episode": episode,
-        "repeat_of": None,
-        "source": "simulated",
-        "tool": "test",
-        "versions": {},
-        "notes": "",
-    }
-    return Meta(**{**usual, **changes})
+    usual: dict[str, Any] = {"rate_hz": 200.0, "kp": (KP,) * 2, "kd": (KD,) * 2}
+    return made.meta(changes.pop("joints", JOINTS), episode=episode, **(usual | changes))
 
 
 def drive(episode: str, seed: int, seconds: float = 4.0, **changes: Any) -> Recording:

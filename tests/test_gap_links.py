@@ -18,9 +18,10 @@ from go1exp.gap.robots.description import ModelConfig, parse_model
 from go1exp.gap.robots.fixed_base import FixedBase
 from go1exp.gap.search.fit import scores
 from go1exp.gap.stages.explain import explain
-from go1exp.logs.recording import Meta, Recording, joint_channel
+from go1exp.logs.recording import Recording, joint_channel
 from go1exp.sim.effects.base import Measured
 from go1exp.sim.env.plant import Plant
+from tests import made
 
 LEG = """
 <mujoco>
@@ -86,10 +87,9 @@ def recorded(robot: FixedBase, effects: Mapping[str, Mapping[str, Any]], seconds
         channels = {"q": q + 2e-4 * rng.standard_normal(q.shape), "qd": qd + 0.02 * rng.standard_normal(q.shape)}
         channels["q_target"] = target[::EVERY]
         about: dict[str, Any] = {"robot": "leg", "rate_hz": 1 / (EVERY * STEP), "base": "fixed", "base_quat": quat}
-        about |= {"kp": (25.0,) * 3, "kd": (0.6,) * 3, "tau_limit": None, "excitation": f"sines{n % 2}"}
-        about |= {"repeat_of": None, "source": "simulated", "tool": "test", "versions": {}, "notes": ""}
+        about |= {"kp": (25.0,) * 3, "kd": (0.6,) * 3, "excitation": f"sines{n % 2}"}
         columns = {joint_channel(c, j): v[:, i].copy() for c, v in channels.items() for i, j in enumerate(JOINTS)}
-        found.append(Recording(Meta(joints=JOINTS, episode=f"e{n}", **about), {"t": t[::EVERY].copy(), **columns}))
+        found.append(Recording(made.meta(JOINTS, episode=f"e{n}", **about), {"t": t[::EVERY].copy(), **columns}))
     return found
 
 

@@ -33,9 +33,10 @@ from go1exp.gap.search.certainty import resampled_values
 from go1exp.gap.search.state import LastCheck, begun
 from go1exp.gap.stages.explain import explain
 from go1exp.logs.importers import import_recordings
-from go1exp.logs.recording import Meta, Recording, joint_channel
+from go1exp.logs.recording import Recording, joint_channel
 from go1exp.sim.effects.tolerances import declared
 from go1exp.sim.env.plant import Plant
+from tests import made
 
 MODELS = sorted(f.stem for f in (data_root() / "conf/model").glob("*.yaml") if f.stem != "go1")
 DATA = Path(os.environ.get("GO1EXP_DATA", data_root().parent / "shared/data"))
@@ -218,12 +219,11 @@ def test_a_robot_carries_its_tolerances_and_another_robot_beside_it_has_others()
 
 def recording(joints: tuple[str, ...], t: np.ndarray, channels: Mapping[str, np.ndarray], **about: Any) -> Recording:
     usual: dict[str, Any] = {"robot": "servo_pendulum_xl330", "rate_hz": 1 / float(np.median(np.diff(t)))}
-    usual |= {"base": "fixed", "base_quat": LEVEL, "kp": None, "kd": None, "tau_limit": None, "excitation": "sine"}
-    usual |= {"episode": "one", "repeat_of": None, "source": "measured", "tool": "test", "versions": {}, "notes": ""}
+    usual |= {"excitation": "sine", "source": "measured"}
     columns = {"t": t} | {
         joint_channel(k, j): v[:, i].copy() for k, v in channels.items() for i, j in enumerate(joints)
     }
-    return Recording(Meta(joints=joints, **(usual | about)), columns)
+    return Recording(made.meta(joints, **(usual | about)), columns)
 
 
 def servo(episode: str = "one", seconds: float = 6.0, **about: Any) -> Recording:

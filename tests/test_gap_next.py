@@ -45,9 +45,10 @@ from go1exp.logs import recording
 from go1exp.logs.excitations import ExcitationError
 from go1exp.logs.record.motions import playback
 from go1exp.logs.record.simulate import held_quat
-from go1exp.logs.recording import Meta, Recording, joint_channels
+from go1exp.logs.recording import Recording, joint_channels
 from go1exp.robot import JOINTS, NOMINAL_STANCE, soft_limits
 from go1exp.sim.env.plant import Plant
+from tests import made
 from tests.laboratory import recorded
 
 ARM = """<mujoco><compiler angle="radian"/><worldbody><body name="stand" pos="0 0 1">
@@ -102,14 +103,11 @@ def told(
                 plant.step(target)
         rng, values = np.random.default_rng(k + 10), np.array(rows)  # T 3 J
         values[:, :2] += np.array([[2e-4], [0.02]]) * rng.standard_normal((len(t), 2, len(joints)))
-        about: dict[str, Any] = {"robot": "arm", "joints": joints, "rate_hz": 500.0, "base": "fixed", "notes": ""}
-        gains = {"kp": (15.0,) * len(joints), "kd": (0.3,) * len(joints), "tau_limit": None}
-        about |= {"base_quat": LEVEL, "repeat_of": None, **gains}
-        about |= {"excitation": kind, "source": "simulated", "tool": "test", "versions": {}}
+        about: dict[str, Any] = {"robot": "arm", "kp": (15.0,) * len(joints), "kd": (0.3,) * len(joints)}
         channels = {"t": t}
         for c, quantity in enumerate(("q", "qd", "q_target")):
             channels |= dict(zip(joint_channels(quantity, joints), values[:, c].T, strict=True))
-        found.append(Recording(Meta(episode=f"{kind}_{k}", **about), channels))
+        found.append(Recording(made.meta(joints, episode=f"{kind}_{k}", excitation=kind, **about), channels))
     return found
 
 

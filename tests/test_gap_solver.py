@@ -32,6 +32,7 @@ from go1exp.logs.record import simulate
 from go1exp.logs.recording import Meta, Recording
 from go1exp.sim.effects.tolerances import DECLARED
 from go1exp.sim.task import parse_parts
+from tests import made
 from tests.laboratory import recorded
 
 QUICK = GapSettings(
@@ -144,10 +145,8 @@ def test_max_t_sees_what_one_group_gains_and_still_says_how_often_that_is_chance
 
 
 def meta(episode: str, excitation: str, kd: float, repeat_of: str | None = None) -> Meta:
-    usual: dict[str, Any] = {"robot": "go1", "joints": ("a",), "rate_hz": 500.0, "base": "fixed"}
-    usual |= {"base_quat": (1.0, 0.0, 0.0, 0.0), "kp": (20.0,), "tau_limit": None, "source": "simulated"}
-    about: dict[str, Any] = {"tool": "test", "versions": {}, "notes": "", "repeat_of": repeat_of}
-    return Meta(kd=(kd,), excitation=excitation, episode=episode, **usual, **about)
+    about: dict[str, Any] = {"episode": episode, "excitation": excitation, "repeat_of": repeat_of}
+    return made.meta(("a",), kp=(20.0,), kd=(kd,), **about)
 
 
 def test_episodes_that_have_a_like_are_held_out_whole() -> None:

@@ -20,7 +20,6 @@ from scipy.spatial.transform import Rotation
 
 from go1exp import robot
 from go1exp.cli.places import shipped_policies
-from go1exp.config.compose import compose
 from go1exp.deploy.estimation import go1
 from go1exp.deploy.estimation.feet import CalibrationError, FootCalibration, calibrated, forces_by_torque, kinematics
 from go1exp.deploy.export.build import build
@@ -41,30 +40,16 @@ from go1exp.deploy.sim_robot.server import GONE_S, STRANGER, TRUTH, FootSensors,
 from go1exp.logs import recording
 from go1exp.robot.go1_fields import STATE_SIZE
 from go1exp.robot.messages import LowState
-from go1exp.sim.task import parse_train
-from go1exp.train import run_folder, trainer
 from tests.lockstep import World, lockstep
-from tests.small_run import SMALL
+from tests.made import low_state
 
 
-@pytest.fixture(scope="module")
-def file(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A bundle of two tiny iterations: its policy hardly moves, so that a robot stands."""
-    run = tmp_path_factory.mktemp("go1") / "run"
-    container = compose("train", (*SMALL, "actuator.kp=35", "actuator.kd=0.7"))
-    run_folder.write(run, container)
-    trainer.train(parse_train(container), container, run)
-    path = run / "walk.zip"
-    path.write_bytes(build(run, seconds=0.2))
-    return str(path)
-
-
-def play(file: str, out: Path, meddle: Callable[[World], None] = lambda world: None, **sim: Any) -> SimpleNamespace:
+def play(bundle: str, out: Path, meddle: Callable[[World], None] = lambda world: None, **sim: Any) -> SimpleNamespace:
     """Walk for a second by the robot's packets; ``meddle`` is called when the simulated robot is there."""
     plan = Plan(seconds=1.0, stand_up=0.2, lie_down=0.0, brake=0.1, command=CommandConfig((0.4, 0.0, 0.0)))
     output: list[str] = []
     with lockstep(on_server=meddle) as world:
-        status = run_job(Job(file, "sim", plan, str(out), sim=sim, truth=True), output.append)
+        status = run_job(Job(bundle, "sim", plan, str(out), sim=sim, truth=True), output.append)
     account = json.loads(next(out.glob("*.json")).read_text())
     return SimpleNamespace(
         status=status,
@@ -98,7 +83,7 @@ class Spoilt(Network):
             super().put(now, self._old[0])
 
 
-def test_a_walk_stands_a_network_that_loses_doubles_delays_damages_and_replays(file: str, tmp_path: Path) -> None:
+def test_a_walk_stands_a_network_that_loses_doubles_delays_damages_and_replays(bundle: str, tmp_path: Path) -> None:
     ways: list[Spoilt] = []
 
     def spoil(world: World) -> None:
@@ -106,7 +91,7 @@ def test_a_walk_stands_a_network_that_loses_doubles_delays_damages_and_replays(f
         ways[:] = Spoilt(1), Spoilt(2)
         world.server._uplink, world.server._downlink = ways
 
-    done = play(file, tmp_path, spoil)
+    done = play(bundle, tmp_path, spoil)
     assert done.status == 0
     assert done.output[-1] == "walked for 1.0 s, to the end"
     up, down = (way.done for way in ways)
@@ -226,24 +211,24 @@ def test_raw_sensors_without_a_calibration_leave_contact_to_the_torques(
 
 
 @pytest.mark.parametrize("sim", [{}, {"feet": "newton"}])
-def test_a_calibration_of_sensors_that_say_newtons_is_refused(file: str, tmp_path: Path, sim: dict[str, str]) -> None:
-    job = Job(file, "sim", Plan(seconds=1.0), str(tmp_path / "out"), sim=sim, feet=of_sensors(0, tmp_path))
+def test_a_calibration_of_sensors_that_say_newtons_is_refused(bundle: str, tmp_path: Path, sim: dict[str, str]) -> None:
+    job = Job(bundle, "sim", Plan(seconds=1.0), str(tmp_path / "out"), sim=sim, feet=of_sensors(0, tmp_path))
     with pytest.raises(RobotError, match=r"feet\.json: calibrates sensors that report counts.*unless sim\.feet=raw"):
         run_job(job, print)
     assert not (tmp_path / "out").exists()
 
 
-def test_a_calibration_without_scales_is_refused_before_anything_moves(file: str, tmp_path: Path) -> None:
+def test_a_calibration_without_scales_is_refused_before_anything_moves(bundle: str, tmp_path: Path) -> None:
     FootCalibration((1.0, 2.0, 3.0, 4.0)).write(tmp_path / "feet.json")
-    job = Job(file, "sim", Plan(), str(tmp_path / "o"), sim={"feet": "raw"}, feet=str(tmp_path / "feet.json"))
+    job = Job(bundle, "sim", Plan(), str(tmp_path / "o"), sim={"feet": "raw"}, feet=str(tmp_path / "feet.json"))
     with pytest.raises(CalibrationError, match="has no scales"):
         run_job(job, print)
     assert not (tmp_path / "o").exists()
 
 
-def server(file: str, **sim: Any) -> Server:
+def server(bundle: str, **sim: Any) -> Server:
     config = sim_config({"noise": 0.0, **sim})
-    return Server(Robot(bundle_task(file, {}), config), config)
+    return Server(Robot(bundle_task(bundle, {}), config), config)
 
 
 @contextmanager
@@ -264,8 +249,8 @@ def stance_command(**changes: Any) -> bytes:
     return wire.pack_command(LowCmd(**{**usual, **changes}))
 
 
-def test_a_robot_answers_the_first_who_speaks_and_refuses_and_counts_the_others(file: str) -> None:
-    made = server(file)
+def test_a_robot_answers_the_first_who_speaks_and_refuses_and_counts_the_others(bundle: str) -> None:
+    made = server(bundle)
     with speakers(2) as (first, second):
         to = ("127.0.0.1", made.port)
         for wrong in (b"", b"x" * 614, wire.IDLE[:-1], wire.IDLE[:-1] + b"\0"):
@@ -290,8 +275,8 @@ def test_a_robot_answers_the_first_who_speaks_and_refuses_and_counts_the_others(
     made.close()
 
 
-def test_a_robot_holds_its_pose_until_a_command_and_brakes_when_nobody_speaks(file: str) -> None:
-    made = server(file, start="standing")
+def test_a_robot_holds_its_pose_until_a_command_and_brakes_when_nobody_speaks(bundle: str) -> None:
+    made = server(bundle, start="standing")
     with speakers(1) as (client,):
         to = ("127.0.0.1", made.port)
         for _ in range(200):
@@ -310,10 +295,10 @@ def test_a_robot_holds_its_pose_until_a_command_and_brakes_when_nobody_speaks(fi
     made.close()
 
 
-def test_raw_foot_sensors_have_a_zero_and_a_scale_each(file: str) -> None:
+def test_raw_foot_sensors_have_a_zero_and_a_scale_each(bundle: str) -> None:
     counts = {}
     for start in ("suspended", "standing"):
-        made = server(file, start=start, feet="raw", seed=3)
+        made = server(bundle, start=start, feet="raw", seed=3)
         with speakers(1) as (client,):
             client.sendto(wire.IDLE, ("127.0.0.1", made.port))
             made.tick()
@@ -326,8 +311,8 @@ def test_raw_foot_sensors_have_a_zero_and_a_scale_each(file: str) -> None:
     assert np.ptp(scale) > 0.1
 
 
-def test_the_robot_alone_says_who_speaks_and_what_it_refuses(file: str) -> None:
-    made, lines = server(file), list[str]()
+def test_the_robot_alone_says_who_speaks_and_what_it_refuses(bundle: str) -> None:
+    made, lines = server(bundle), list[str]()
     account = Monitor(made, lines.append, _at=0.0)
     with speakers(2) as (first, second):
         to = ("127.0.0.1", made.port)
@@ -385,10 +370,10 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("patient")
-def test_a_check_asks_for_no_torque_and_calibrates_feet_from_lying_and_standing(file: str, tmp_path: Path) -> None:
+def test_a_check_asks_for_no_torque_and_calibrates_feet_from_lying_and_standing(bundle: str, tmp_path: Path) -> None:
     feet, said = tmp_path / "feet.json", list[str]()
     for start in ("standing", "lying", "standing"):
-        made = server(file, start=start, feet="raw", seed=3, noise=0.1)
+        made = server(bundle, start=start, feet="raw", seed=3, noise=0.1)
         with living(made) as heard:
             look = CheckJob(robot.JOINTS, robot.JOINT_POS_LIMITS, feet, f"127.0.0.1:{made.port}")
             assert run_check(look, said.append) == 0, said[-4:]
@@ -408,22 +393,22 @@ def test_a_check_asks_for_no_torque_and_calibrates_feet_from_lying_and_standing(
 
 @pytest.mark.usefixtures("patient")
 def test_a_walk_begins_only_after_the_check_has_passed(
-    file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    bundle: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan = Plan(seconds=0.2, stand_up=0.1, lie_down=0.0, brake=0.1, stale=5.0)
     monkeypatch.setattr(go1_check.Observed, "tick_s", 0.001)  # by the clock, which a busy machine disturbs
-    made = server(file, start="standing")
+    made = server(bundle, start="standing")
     made.packets.health = wire.Health(charge=7)
     there = f"127.0.0.1:{made.port}"
     with living(made) as heard:
         with pytest.raises(RobotError, match=r"does not pass its check.*battery: 7 %; at least 20 % are needed"):
-            run_job(Job(file, "go1", plan, str(tmp_path / "a"), address=there), print)
+            run_job(Job(bundle, "go1", plan, str(tmp_path / "a"), address=there), print)
         assert set(heard) == {wire.IDLE}
         made.packets.health = wire.Health()
         until = made.counts.ticks + round(GONE_S / TICK) + 5
         while made.counts.ticks < until:
             time.sleep(0.01)
-        assert run_job(Job(file, "go1", plan, str(tmp_path / "b"), address=there), print) == 0
+        assert run_job(Job(bundle, "go1", plan, str(tmp_path / "b"), address=there), print) == 0
         assert set(heard) != {wire.IDLE}
     walked = recording.read(next((tmp_path / "b").glob("*.parquet")))
     assert walked.meta.source == "measured"
@@ -448,20 +433,9 @@ def test_nobody_there_is_said_in_a_line(tmp_path: Path, monkeypatch: pytest.Monk
 
 def heard_of(**changes: Any) -> Observed:
     """What a good robot says for a second, with changes."""
-    from go1exp.robot.messages import LowState
-
-    usual: dict[str, Any] = {
-        "joint_pos": robot.NOMINAL_STANCE,
-        "joint_vel": np.zeros(12),
-        "joint_torque": np.zeros(12),
-        "imu_quat": np.array([1.0, 0, 0, 0]),
-        "imu_gyro": np.zeros(3),
-        "imu_acc": np.array([0, 0, 9.81]),
-        "foot_force": np.full(4, 115.0),
-    }
     health = changes.pop("health", wire.Health())
     period = changes.pop("period", 0.002)
-    states = [LowState(period * k, **{**usual, **changes}) for k in range(500)]
+    states = [low_state(period * k, **{"foot_force": np.full(4, 115.0), **changes}) for k in range(500)]
     return Observed(1.0, states, [(2 * k, 0.002 * k) for k in range(500)], health)
 
 
@@ -532,8 +506,8 @@ def test_feet_are_not_calibrated_by_a_robot_that_neither_lies_nor_stands() -> No
     assert after == FootCalibration((100.0,) * 4, (1.0,) * 4)
 
 
-def test_forces_that_balance_the_torques_are_those_under_the_feet(file: str) -> None:
-    made = server(file, start="standing")
+def test_forces_that_balance_the_torques_are_those_under_the_feet(bundle: str) -> None:
+    made = server(bundle, start="standing")
     for _ in range(100):
         made.tick()
     state = made.robot.sense()[0]

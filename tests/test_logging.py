@@ -20,8 +20,9 @@ from stable_baselines3.common import logger as sb3_logger
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import Expected
 from go1exp.sim.task import LoggerConfig, WandbConfig, parse_train
-from go1exp.train import metrics, run_folder, trainer, wandb_writer
+from go1exp.train import metrics, wandb_writer
 from go1exp.train.metrics import CsvWriter, make_logger
+from tests import small_run
 from tests.small_run import small
 
 ROUGH_NUMBERS = (1 / 3, -1e-17, 12345678.9, 0.1 + 0.2, float("nan"), 6.02e23)
@@ -106,12 +107,7 @@ def test_a_file_in_which_nothing_was_written_yet_is_begun_anew(tmp_path: Path) -
 
 
 def train(run: Path, *overrides: str) -> None:
-    container = compose(
-        "train",
-        small("ppo=paper", "logger.tensorboard=true", *overrides, steps=8, iterations=4),
-    )
-    run_folder.write(run, container)
-    trainer.train(parse_train(container), container, run)
+    small_run.train(run, small("ppo=paper", "logger.tensorboard=true", *overrides, steps=8, iterations=4))
 
 
 def test_returns_are_in_the_table_even_if_no_episode_ended_in_the_first_iteration(tmp_path: Path) -> None:

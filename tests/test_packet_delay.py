@@ -16,6 +16,7 @@ from go1exp.deploy.runtime.packet_delay import MOST_SLIP, WINDOW_S, PacketDelay,
 from go1exp.deploy.runtime.report import summary_lines
 from go1exp.robot.go1_fields import PERIOD
 from go1exp.robot.messages import OVERTAKEN_S, LowState
+from tests.made import low_state
 
 
 def test_delays_are_those_beyond_the_fastest_of_the_last_second() -> None:
@@ -90,17 +91,10 @@ def test_the_change_of_the_velocity_is_that_of_a_body_that_turns_and_is_pushed()
 
 def state_at(k: int) -> LowState:
     rng = np.random.default_rng(k)
-    return LowState(
-        t=7.0 + PERIOD * k,
-        clock=PERIOD * k,
-        joint_pos=robot.NOMINAL_STANCE + 0.01 * rng.normal(size=12),
-        joint_vel=rng.normal(size=12),
-        joint_torque=rng.normal(size=12),
-        imu_quat=np.array([1.0, 0.0, 0.0, 0.0]),
-        imu_gyro=0.1 * rng.normal(size=3),
-        imu_acc=np.array([0.5, -0.3, 9.81]) + rng.normal(size=3),
-        foot_force=np.full(4, 30.0),
-    )
+    noisy = {"joint_pos": robot.NOMINAL_STANCE + 0.01 * rng.normal(size=12), "joint_vel": rng.normal(size=12)}
+    noisy |= {"joint_torque": rng.normal(size=12), "imu_gyro": 0.1 * rng.normal(size=3)}
+    acc = np.array([0.5, -0.3, 9.81]) + rng.normal(size=3)
+    return low_state(7.0 + PERIOD * k, clock=PERIOD * k, imu_acc=acc, **noisy)
 
 
 def made() -> KalmanEstimator:

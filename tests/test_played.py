@@ -13,15 +13,9 @@ from go1exp.deploy.runtime.log import _attitude
 from go1exp.logs.excitations import ExcitationError
 from go1exp.logs.record.motions import BLEND_S, GAINS, RATE_HZ, played
 from go1exp.logs.recording import joint_channels
-from go1exp.robot.messages import LowState
+from tests.made import low_state
 
 STANCE = robot.NOMINAL_STANCE
-
-
-def state(joint_pos: np.ndarray) -> LowState:
-    nothing = np.zeros(12)
-    attitude = np.array([1.0, 0.0, 0.0, 0.0])
-    return LowState(0.0, joint_pos, nothing, nothing, attitude, np.zeros(3), np.zeros(3), np.zeros(4))
 
 
 def table(path: Path, **changed: np.ndarray) -> Path:
@@ -43,7 +37,7 @@ def test_a_file_is_played_at_its_own_rate_and_gains_from_the_nominal_stance(tmp_
     motion = played(str(table(tmp_path / "next.csv")), None, None, None, 0)
     assert (motion.name, motion.rate) == ("playback", pytest.approx(100.0))
     assert motion.seconds == pytest.approx(BLEND_S + 0.11)
-    sent = [motion.step(np.zeros(3), state(STANCE - 0.1), np.zeros(3)) for _ in range(215)]
+    sent = [motion.step(np.zeros(3), low_state(joint_pos=STANCE - 0.1), np.zeros(3)) for _ in range(215)]
     targets, blend = np.array([command.joint_target for command in sent]), round(100 * BLEND_S)
     np.testing.assert_allclose(targets[0], STANCE, atol=1e-12)  # where standing up has brought it
     np.testing.assert_allclose(np.diff(targets[: blend + 1], axis=0), 0.05 / blend, atol=1e-6)  # at a constant speed
@@ -58,8 +52,12 @@ def test_an_excitation_is_played_by_name() -> None:
     assert (motion.name, motion.rate, motion.seconds) == ("chirp", RATE_HZ, pytest.approx(BLEND_S + 3.0))
     assert [gain[0] for gain in motion.gains] == list(GAINS)
     assert [gain[0] for gain in played("chirp", 3.0, 200.0, (35.0, 0.6), 1).gains] == [35.0, 0.6]
-    blend = [motion.step(np.zeros(3), state(STANCE), np.zeros(3)) for _ in range(round(RATE_HZ * BLEND_S))]
-    moved = np.array([motion.step(np.zeros(3), state(STANCE), np.zeros(3)).joint_target for _ in range(1200)])
+    blend = [
+        motion.step(np.zeros(3), low_state(joint_pos=STANCE), np.zeros(3)) for _ in range(round(RATE_HZ * BLEND_S))
+    ]
+    moved = np.array(
+        [motion.step(np.zeros(3), low_state(joint_pos=STANCE), np.zeros(3)).joint_target for _ in range(1200)]
+    )
     assert len(blend)
     assert np.ptp(moved, axis=0).min() > 0.1
 

@@ -22,9 +22,7 @@ from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError
 from go1exp.deploy.export.build import build
 from go1exp.deploy.runtime.bundle import BundleError
-from go1exp.sim.task import parse_train
-from go1exp.train import run_folder, trainer
-from tests.small_run import SMALL
+from tests.small_run import trained
 from tests.test_cli import assert_refused
 
 QUICK = (
@@ -37,11 +35,7 @@ QUICK = (
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of two tiny iterations, randomised as in Table I."""
-    folder = tmp_path_factory.mktemp("protocols") / "run"
-    container = compose("train", [*SMALL, "rand=table1", "terrain=flat"])
-    run_folder.write(folder, container)
-    trainer.train(parse_train(container), container, folder)
-    return folder
+    return trained(tmp_path_factory.mktemp("protocols") / "run", "rand=table1", "terrain=flat")
 
 
 @pytest.fixture(scope="module")

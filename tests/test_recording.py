@@ -23,23 +23,12 @@ from go1exp.config.schema.physics import ContactConfig
 from go1exp.logs import recording as rec
 from go1exp.logs.recording import Meta, Recording, RecordingError
 from go1exp.robot import JOINTS, LEGS
+from tests.made import meta
 
-META = Meta(
-    robot="arm",
-    joints=("shoulder", "elbow"),
-    rate_hz=100.0,
-    base="fixed",
-    base_quat=(1.0, 0.0, 0.0, 0.0),
-    kp=(20.0, 10.0),
-    kd=(0.5, 0.25),
-    tau_limit=None,
-    excitation="chirp",
-    episode="arm_chirp_0",
-    repeat_of=None,
-    source="simulated",
-    tool="test",
-    versions={"numpy": "2"},
-    notes="",
+META = meta(
+    ("shoulder", "elbow"),
+    **{"robot": "arm", "rate_hz": 100.0, "kp": (20.0, 10.0), "kd": (0.5, 0.25), "excitation": "chirp"},
+    **{"episode": "arm_chirp_0", "versions": {"numpy": "2"}},
 )
 GO1 = replace(META, robot="go1", joints=JOINTS, kp=(20.0,) * 12, kd=None)
 

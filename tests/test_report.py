@@ -517,13 +517,10 @@ def test_the_page_needs_nothing_beside_it(two_groups: Path) -> None:
 
 
 def test_eval_true_evaluates_what_is_missing_with_the_runs_own_policy(tmp_path: Path) -> None:
-    from go1exp.sim.task import parse_train
-    from go1exp.train import run_folder, run_state, trainer
-    from tests.small_run import SMALL
+    from go1exp.train import run_state
+    from tests.small_run import trained
 
-    container = compose("train", [*SMALL, "ppo.iterations=1"])
-    run_folder.write(tmp_path / "r", container)
-    trainer.train(parse_train(container), container, tmp_path / "r")
+    trained(tmp_path / "r", "ppo.iterations=1")
     run_state.write(tmp_path / "r", "done")
     brief = {"x": [0.5], "y": [], "yaw": [], "episodes": 3, "duration_s": 0.2, "settle_s": 0.1}
     changes = [f"evaluation.{key}={value}" for key, value in brief.items()]

@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 import termios
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -21,12 +21,10 @@ import pytest
 import torch
 
 from go1exp.base.paths import data_root
-from go1exp.config.compose import compose
-from go1exp.sim.task import parse_train
 from go1exp.train import checkpoint, metrics, run_folder, trainer
 from tests.command import COMMAND_LINE, run_alone
 from tests.command import run as cli
-from tests.small_run import small
+from tests.small_run import small, train
 
 SMALL = (
     *small(num_envs=8, steps=8, epochs=2),
@@ -64,14 +62,6 @@ def signalled(self, values, excluded, step=0):
 CsvWriter.write = signalled
 sys.exit(main())
 """
-
-
-def train_here(run: Path, overrides: Sequence[str]) -> None:
-    """Do in this process what ``go1exp train`` does in its own."""
-    container = compose("train", overrides)
-    config = parse_train(container)
-    run_folder.write(run, container)
-    trainer.train(config, container, run)
 
 
 def rows(file: Path) -> list[dict[str, str]]:
@@ -149,7 +139,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def flat(folder: Path) -> Path:
     """Six iterations without a stop."""
-    train_here(folder / "flat", [*FLAT, SIX])
+    train(folder / "flat", [*FLAT, SIX])
     return folder / "flat"
 
 
@@ -230,13 +220,13 @@ def test_a_run_on_rough_ground_stopped_by_sigterm_goes_on_with_resume(
     folder: Path, monkeypatch: pytest.MonkeyPatch, usual_handler: Callable[[int, FrameType | None], None]
 ) -> None:
     reference, run = folder / "rough", folder / "terminated"
-    train_here(reference, [*ROUGH, SIX])
+    train(reference, [*ROUGH, SIX])
     levels = {row["curriculum/terrain_level"] for row in rows(reference / "metrics.csv")}
     assert len(levels) > 1  # the curriculum moves
 
     signal_after(monkeypatch, 3, signal.SIGTERM)
     with pytest.raises(trainer.Stopped):
-        train_here(run, [*ROUGH, SIX])
+        train(run, [*ROUGH, SIX])
     assert signal.getsignal(signal.SIGTERM) is usual_handler
     assert iterations(run / "metrics.csv") == [1, 2, 3]
 
@@ -255,7 +245,7 @@ def test_a_second_signal_is_heard_and_costs_no_checkpoint(
 ) -> None:
     signal_after(monkeypatch, 3, *numbers)
     with pytest.raises(trainer.Stopped):
-        train_here(tmp_path / "run", [*FLAT, SIX])
+        train(tmp_path / "run", [*FLAT, SIX])
     assert checkpoint.checkpoints(tmp_path / "run")[-1].name == "000003.pt"
     assert signal.getsignal(signal.SIGINT) is usual_handler
     words = capsys.readouterr().err
@@ -268,7 +258,7 @@ def test_a_third_ctrl_c_ends_the_run_at_once(
 ) -> None:
     signal_after(monkeypatch, 3, signal.SIGINT, signal.SIGINT, signal.SIGINT)
     with pytest.raises(Again):
-        train_here(tmp_path / "run", [*FLAT, SIX])
+        train(tmp_path / "run", [*FLAT, SIX])
     assert [p.name for p in checkpoint.checkpoints(tmp_path / "run")] == ["000002.pt"]
     assert signal.getsignal(signal.SIGINT) is usual_handler
 
@@ -278,7 +268,7 @@ def test_a_signal_in_the_last_iteration_leaves_a_finished_run(
 ) -> None:
     signal_after(monkeypatch, 2, signal.SIGTERM)
     with pytest.raises(trainer.Stopped) as caught:
-        train_here(tmp_path / "run", [*FLAT, "ppo.iterations=2"])
+        train(tmp_path / "run", [*FLAT, "ppo.iterations=2"])
     assert caught.value.finished
 
 
@@ -309,13 +299,13 @@ def test_the_end_of_the_terminal_costs_no_checkpoint(tmp_path: Path) -> None:
 def test_a_run_killed_before_its_first_checkpoint_begins_anew_without_a_row_twice(flat: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(flat, run, ignore=lambda *_: ["checkpoints"])
-    train_here(run, [*FLAT, SIX])
+    train(run, [*FLAT, SIX])
     assert_the_same_run(run, flat)
 
 
 def test_a_finished_run_is_extended_as_if_it_had_been_meant_to_be_longer(flat: Path, tmp_path: Path) -> None:
-    train_here(tmp_path / "run", [*FLAT, "ppo.iterations=3"])
-    train_here(tmp_path / "run", [*FLAT, SIX])
+    train(tmp_path / "run", [*FLAT, "ppo.iterations=3"])
+    train(tmp_path / "run", [*FLAT, SIX])
     assert_the_same_run(tmp_path / "run", flat)
 
 
@@ -337,7 +327,7 @@ def test_a_damaged_checkpoint_is_passed_over_with_a_warning(damage: str, flat: P
     assert state["iteration"] == 2
     if damage == "truncated":
         with pytest.warns(UserWarning, match=r"000004\.pt: damaged"):
-            train_here(killed_copy, [*FLAT, SIX])
+            train(killed_copy, [*FLAT, SIX])
         assert_the_same_run(killed_copy, flat)
 
 
@@ -385,7 +375,7 @@ def test_with_no_whole_checkpoint_left_nothing_is_trained_over(killed_copy: Path
     before = (killed_copy / "metrics.csv").read_bytes()
     none_whole = rf"{killed_copy}: none of its 2 checkpoints can be read"
     with pytest.warns(UserWarning, match="damaged"), pytest.raises(checkpoint.DamagedCheckpoint, match=none_whole):
-        train_here(killed_copy, [*FLAT, SIX])
+        train(killed_copy, [*FLAT, SIX])
     assert (killed_copy / "metrics.csv").read_bytes() == before
 
 

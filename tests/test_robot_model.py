@@ -12,10 +12,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from go1exp import robot
-from go1exp.base.paths import data_root
 from go1exp.sim.physics.scene import load_robot
 
-IN_SDK_ORDER = list(robot.LEGS)
 POSES = {
     "isaac_lab": robot.NOMINAL_STANCE,
     "home": np.tile([0.0, 0.9, -1.8], 4),
@@ -51,23 +49,6 @@ def feet(joints: np.ndarray) -> np.ndarray:
     """Foot centres (4, 3) in the trunk frame, m, by the compiled model."""
     data = at_origin(bare_model(), joints)
     return np.array([data.site(f"{leg}_foot").xpos for leg in robot.LEGS])
-
-
-def feet_closed_form(joints: np.ndarray) -> np.ndarray:
-    """Foot centres (4, 3) in the trunk frame, m, by trigonometry from the URDF's joint origins and axes."""
-    offset, thigh, calf = robot.LINK_LENGTHS
-    points = []
-    for leg, (a, b, c) in zip(robot.LEGS, np.reshape(joints, (4, 3)), strict=True):
-        front, left = (1 if leg[0] == "F" else -1), (1 if leg[1] == "L" else -1)
-        down = -thigh * np.cos(b) - calf * np.cos(b + c)
-        points.append(
-            [
-                front * robot.HIP_OFFSET[0] - thigh * np.sin(b) - calf * np.sin(b + c),
-                left * (robot.HIP_OFFSET[1] + offset * np.cos(a)) - down * np.sin(a),
-                left * offset * np.sin(a) + down * np.cos(a),
-            ]
-        )
-    return np.array(points)
 
 
 def random_joints(count: int, seed: int = 0) -> np.ndarray:
@@ -220,11 +201,6 @@ def test_imu_sits_where_the_urdf_puts_it() -> None:
     assert_allclose(imu.quat, [1, 0, 0, 0], atol=0)
 
 
-def test_data_root_holds_configurations_and_assets() -> None:
-    assert (data_root() / "conf").is_dir()
-    assert (data_root() / "assets/go1/go1.xml").is_file()
-
-
 def test_an_unknown_inertia_is_refused_by_name() -> None:
     with pytest.raises(ValueError, match="heavy"):
         load_robot("heavy")
@@ -282,12 +258,6 @@ def test_foot_spheres_sit_on_the_foot_sites() -> None:
 @pytest.mark.parametrize(("inertia", "mass"), [("merged", 12.743448), ("rotor_complete", 13.099448)])
 def test_total_mass(inertia: str, mass: float) -> None:
     assert bare_model(inertia).body_mass.sum() == pytest.approx(mass, abs=1e-4)
-
-
-@pytest.mark.parametrize("leg", IN_SDK_ORDER)
-def test_leg_mass(leg: str) -> None:
-    model = bare_model()
-    assert sum(model.body(f"{leg}_{kind}").mass[0] for kind in robot.JOINT_KINDS) == pytest.approx(1.884862, abs=1e-5)
 
 
 def rotor(axis: int) -> Inertial:
@@ -356,22 +326,6 @@ def test_principal_moments(kind: str, moments: list[float]) -> None:
         assert_allclose(bare_model().body(body).inertia, moments, rtol=1e-5)
 
 
-@pytest.mark.parametrize(("right", "left"), [("FR", "FL"), ("RR", "RL")])
-@pytest.mark.parametrize("kind", ["hip", "thigh"])
-def test_left_and_right_inertials_mirror(right: str, left: str, kind: str) -> None:
-    a, b = (body_inertial(bare_model(), f"{leg}_{kind}") for leg in (right, left))
-    assert a.mass == b.mass
-    assert_allclose(a.com, MIRROR @ b.com, atol=1e-15)
-    assert_allclose(a.inertia, MIRROR @ b.inertia @ MIRROR, atol=1e-13)
-
-
-def test_all_calves_are_the_same_part() -> None:
-    first, *others = (body_inertial(bare_model(), f"{leg}_calf") for leg in robot.LEGS)
-    for other in others:
-        assert_allclose(other.com, first.com, atol=0)
-        assert_allclose(other.inertia, first.inertia, atol=1e-15)
-
-
 @pytest.mark.parametrize(
     ("inertia", "pose", "com"),
     [
@@ -429,11 +383,6 @@ def test_foot_positions(angles: tuple[float, float, float], leg: str, foot: tupl
     assert_allclose(feet(np.tile(angles, 4))[robot.LEGS.index(leg)], foot, atol=1e-5)
 
 
-def test_feet_agree_with_the_closed_form_at_random_angles() -> None:
-    for joints in random_joints(200):
-        assert_allclose(feet(joints), feet_closed_form(joints), atol=1e-12)
-
-
 def test_mirrored_joints_give_mirrored_feet() -> None:
     for joints in random_joints(50, seed=1):
         mirrored = joints[list(robot.MIRROR_JOINTS)] * robot.MIRROR_JOINT_SIGNS
@@ -453,23 +402,22 @@ def test_first_touch_height(pose: str, height: float) -> None:
 # ------------------------------------------------------------------------------------------------------------ standing
 
 
-@pytest.mark.parametrize(("pose", "height"), [("isaac_lab", 0.3109), ("home", 0.2764), ("mjlab", 0.2842)])
-def test_stiff_legs_settle_level(pose: str, height: float) -> None:
-    stand = standing(pose, 100.0, 2.0)
-    assert stand.height == pytest.approx(height, abs=3e-3)
-    assert abs(stand.pitch_deg) < 1.0
-
-
-def test_the_gains_of_the_real_robot_hold_the_nominal_stance() -> None:
-    stand = standing("isaac_lab", 20.0, 0.5)
-    assert 0.259 - 0.010 <= stand.height <= 0.263 + 0.010
-    assert 2.2 <= stand.pitch_deg <= 3.0
-
-
-def test_medium_gains_settle_in_between() -> None:
-    stand = standing("isaac_lab", 35.0, 0.5)
-    assert stand.height == pytest.approx(0.290, abs=5e-3)
-    assert stand.pitch_deg == pytest.approx(1.0, abs=0.5)
+@pytest.mark.parametrize(
+    ("pose", "gains", "height", "pitch_deg"),
+    [
+        ("isaac_lab", (100.0, 2.0), (0.3109, 3e-3), (0.0, 1.0)),
+        ("home", (100.0, 2.0), (0.2764, 3e-3), (0.0, 1.0)),
+        ("mjlab", (100.0, 2.0), (0.2842, 3e-3), (0.0, 1.0)),
+        ("isaac_lab", (20.0, 0.5), (0.261, 0.012), (2.6, 0.4)),  # the real robot's
+        ("isaac_lab", (35.0, 0.5), (0.290, 5e-3), (1.0, 0.5)),
+    ],
+)
+def test_legs_settle_level_the_lower_the_softer(
+    pose: str, gains: tuple[float, float], height: tuple[float, float], pitch_deg: tuple[float, float]
+) -> None:
+    stand = standing(pose, *gains)
+    assert stand.height == pytest.approx(height[0], abs=height[1])
+    assert stand.pitch_deg == pytest.approx(pitch_deg[0], abs=pitch_deg[1])
 
 
 GAINS = [(20.0, 0.5), (35.0, 0.5), (100.0, 2.0)]

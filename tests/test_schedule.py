@@ -17,7 +17,7 @@ from go1exp.sim.task import parse_train
 from go1exp.train import checkpoint, preflight, trainer
 from go1exp.train.schedule import Schedule
 from tests import test_resume
-from tests.test_resume import SIX, assert_the_same_run, rows, train_here
+from tests.test_resume import SIX, assert_the_same_run, rows, train
 
 FLAT = (*test_resume.FLAT, "reward=paper_literal", "schedule=none", "actuator=pd", "contact=soft", "command=paper")
 
@@ -59,7 +59,7 @@ def stepped(core: Any, times: int = 6) -> torch.Tensor:
 
 def test_a_ramp_is_the_line_between_its_ends_in_steps_of_all_robots(tmp_path: Path) -> None:
     delay = "set: actuator.command, from: [0.0, 0.0], to: [0.0, 0.02], over: 0, start: 200"
-    train_here(tmp_path, [*FLAT, SIX, "actuator=delay", ramp(f"{WEIGHT}, start: 96, over: 128"), ramp(delay, "d")])
+    train(tmp_path, [*FLAT, SIX, "actuator=delay", ramp(f"{WEIGHT}, start: 96, over: 128"), ramp(delay, "d")])
     log = rows(tmp_path / "metrics.csv")
     # Iterations begin after 0, 64, 128, ... steps: 1 + 2 (128 - 96) / 128 = 1.5 in the third.
     assert [float(row["schedule/x"]) for row in log] == [1.0, 1.0, 1.5, 2.5, 3.0, 3.0]
@@ -201,16 +201,16 @@ def test_a_run_that_was_stopped_continues_its_schedule_to_the_bit(tmp_path: Path
              "iterations: 3}", "when"),
     ]  # fmt: skip
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    train_here(whole, [*settings, SIX])
-    train_here(parts, [*settings, "ppo.iterations=3"])
-    train_here(parts, [*settings, SIX])
+    train(whole, [*settings, SIX])
+    train(parts, [*settings, "ppo.iterations=3"])
+    train(parts, [*settings, SIX])
     assert_the_same_run(parts, whole)
     assert {float(row["schedule/when"]) for row in rows(whole / "metrics.csv")} >= {1.0, 5.5, 10.0}
     assert checkpoint.load_latest(whole)[0]["schedule"]["when"]["started"] is not None
 
 
 def test_a_run_without_a_schedule_has_no_trace_of_one(tmp_path: Path) -> None:
-    train_here(tmp_path, [*FLAT, "ppo.iterations=1"])
+    train(tmp_path, [*FLAT, "ppo.iterations=1"])
     assert "schedule" not in checkpoint.load_latest(tmp_path)[0]
     assert not [column for column in rows(tmp_path / "metrics.csv")[0] if column.startswith("schedule")]
     container = compose("train", FLAT)
@@ -219,7 +219,7 @@ def test_a_run_without_a_schedule_has_no_trace_of_one(tmp_path: Path) -> None:
 
 
 def test_every_metric_of_a_training_may_start_a_ramp(tmp_path: Path) -> None:
-    train_here(tmp_path, [*FLAT, "ppo.iterations=1"])
+    train(tmp_path, [*FLAT, "ppo.iterations=1"])
     constant = {"train/clip_range", "train/clip_range_vf", "train/n_updates"}
     for name in set(rows(tmp_path / "metrics.csv")[0]) - {"iteration", "steps"} - constant:
         preflight.check(train_config(ramp(f"{WEIGHT}, over: 1, when: {{measure: {name}, below: 0}}")))

@@ -38,6 +38,7 @@ from go1exp.evaluate.viewer.walk import WalkShow
 from go1exp.gap.result import GapResult, Overlay
 from go1exp.logs.recording import Meta, Recording, RecordingError, joint_channels
 from go1exp.sim.task import parse_parts
+from tests.made import meta
 
 GO1 = parse_parts(compose("train", []), ("robot",))[0]["robot"]
 
@@ -309,22 +310,10 @@ def recording(base: str = "floating", **about: str) -> Recording:
             f"imu_quat_{axis}": np.full(500, value) for axis, value in zip("wxyz", (1.0, 0, 0, 0), strict=True)
         }
     quat = (1.0, 0.0, 0.0, 0.0) if base == "fixed" else None
-    known: dict[str, Any] = {"robot": "go1", "episode": "walk", "tool": "test", "notes": "", **about}
-    meta = Meta(
-        joints=robot.JOINTS,
-        rate_hz=500.0,
-        base=base,  # type: ignore[arg-type]
-        base_quat=quat,
-        kp=None,
-        kd=None,
-        tau_limit=None,
-        excitation=None,
-        repeat_of=None,
-        source="measured",
-        versions={},
-        **known,
+    known: dict[str, Any] = {"episode": "walk", "source": "measured", **about}
+    return Recording(
+        meta(base=base, base_quat=quat, **known), {name: np.asarray(v, dtype=float) for name, v in channels.items()}
     )
-    return Recording(meta, {name: np.asarray(v, dtype=float) for name, v in channels.items()})
 
 
 @pytest.mark.parametrize("base", ["floating", "fixed"])

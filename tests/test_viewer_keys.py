@@ -24,9 +24,7 @@ from go1exp.evaluate.viewer.sim_window import SimShow
 from go1exp.evaluate.viewer.walk import WalkShow
 from go1exp.gap import files
 from go1exp.logs.recording import write
-from go1exp.sim.task import parse_train
-from go1exp.train import run_folder, trainer
-from tests.small_run import SMALL
+from tests.small_run import trained
 from tests.test_viewer import answer, recording
 
 ELSEWHERE = "127.0.0.2"
@@ -94,9 +92,7 @@ def test_a_bundle_walks_on_the_page_and_hands_over(
     tmp_path: Path, opened: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    container = compose("train", [*SMALL, "terrain=flat"])
-    run_folder.write(tmp_path / "run", container)
-    trainer.train(parse_train(container), container, tmp_path / "run")
+    trained(tmp_path / "run", "terrain=flat")
     (tmp_path / "mine.zip").write_bytes(build(tmp_path / "run", seconds=0.1))
     show = page(play, "play", ["bundle=mine.zip", "viewer=web", "velocity=[0.3,0,0]"], opened)
     assert isinstance(show, WalkShow)

@@ -65,19 +65,6 @@ def moment(n: int, k: int) -> tuple[Tensor, Tensor, Tensor]:
     return joint_noise(n, 0.3, k), joint_noise(n, 0.3, k + 100), joint_noise(n, 3.0, k + 200)
 
 
-def test_it_never_exceeds_the_torque_limit(build: Callable[..., Actuator]) -> None:
-    actuator = build(20)
-    limit = torch.tensor([23.7, 23.7, 35.55] * 4, dtype=torch.float64)
-    reached = torch.zeros(12, dtype=torch.bool)
-    for k in range(20):
-        tau = actuator.torque(joint_noise(20, 5.0, k), joint_noise(20, 5.0, k + 100), joint_noise(20, 20.0, k + 200))
-        assert tau.shape == (20, 12)
-        assert tau.dtype == torch.float64
-        assert (tau.abs() <= limit).all()
-        reached |= (tau.abs() > 0.999 * limit).any(0)
-    assert reached.all()
-
-
 def test_it_gives_no_torque_without_error_at_rest(build: Callable[..., Actuator]) -> None:
     actuator = build(3)
     q = torch.as_tensor(robot.NOMINAL_STANCE).repeat(3, 1)
@@ -109,28 +96,6 @@ def test_it_begins_an_episode_as_if_it_were_the_first(build: Callable[..., Actua
         actuator.reset(torch.ones(4, dtype=torch.bool))
     for k in range(20):
         assert torch.equal(used.torque(*moment(4, k)), new.torque(*moment(4, k))), k
-
-
-def test_an_episode_that_begins_leaves_the_others_alone(build: Callable[..., Actuator]) -> None:
-    one, other = build(4), build(4)
-    for k in range(20):
-        if k == 7:
-            one.reset(torch.tensor([True, False, True, False]))
-        a, b = one.torque(*moment(4, k)), other.torque(*moment(4, k))
-        assert torch.equal(a[[1, 3]], b[[1, 3]]), k
-
-
-def test_it_continues_from_its_saved_state_and_leaves_its_inputs_alone(build: Callable[..., Actuator]) -> None:
-    first, second = build(3), build(3)
-    for k in range(20):
-        inputs = moment(3, k)
-        copies = [x.clone() for x in inputs]
-        tau = first.torque(*inputs)
-        assert all(torch.equal(a, b) for a, b in zip(inputs, copies, strict=True))
-        if k >= 10:
-            assert torch.equal(tau, second.torque(*inputs))
-        elif k == 9:
-            second.load_state_dict(first.state_dict())
 
 
 def test_a_saved_state_is_a_copy(build: Callable[..., Actuator]) -> None:

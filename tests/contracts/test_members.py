@@ -50,6 +50,10 @@ def test_a_registered_term_keeps_what_its_group_promises(entry: Entry, needs: di
     check_term(tried, needs.get(entry.name), exact=entry.name not in ROUNDS)
 
 
+def test_a_net_whose_commands_are_delayed_keeps_what_actuators_promise(needs: dict[str, dict[str, Any]]) -> None:
+    check_term(members("actuator")["delay"], {"drive": {"term": "net", **needs["net"]}})
+
+
 # ---------------------------------------------------------------------- the checks find what they are for
 
 

@@ -249,23 +249,6 @@ def test_a_free_mass_bounces_with_the_restitution_it_was_given(
     assert bounce(foot) == pytest.approx(restitution, abs=0.03)
 
 
-TABLE_I: dict[str, Any] = {
-    "foot_friction": (0.4, 1.1),
-    "center_of_mass": (-0.025, 0.025),
-    "link_mass": (0.8, 1.3),
-    "body_velocity": (-0.25, 0.25),
-    "body_position": (-0.5, 0.5),
-    "body_orientation": (-0.02, 0.02),
-    "joint_positions": (-0.3, 0.3),
-    "joint_velocities": (-2.5, 2.5),
-}
-
-
-def test_the_ranges_are_those_of_table_i_in_the_file_and_by_default(make_task: Callable[..., TaskConfig]) -> None:
-    assert {t.key: tuple(t.parameters["range"]) for t in make_task("rand=table1").rand} == TABLE_I
-    assert {name: members("rand")[name].parameters["range"].default for name in TABLE_I} == TABLE_I
-
-
 # Randomisations of the initial state
 
 
@@ -286,19 +269,6 @@ def test_a_state_term_changes_its_own_part_of_the_state_in_every_row(entry: Entr
     for name, values in parts(state).items():
         changed = (values != before[name]).any(1)
         assert changed.all() if name in WRITES[entry.name] else not changed.any(), name
-
-
-@each("rand", kind="state")
-def test_a_state_term_with_a_range_of_zero_changes_nothing(entry: Entry) -> None:
-    operations: list[dict[str, Any]] = [{}]
-    if "operation" in entry.parameters:
-        operations = [{"operation": "add"}, {"operation": "scale"}]
-    for parameters in operations:
-        state = start_states(6)
-        before = parts(state)
-        entry.target(state, stream(6), range=(0.0, 0.0), **parameters)
-        for name, values in parts(state).items():
-            assert torch.equal(values, before[name]), name
 
 
 def test_state_terms_add_uniform_draws_of_table_i() -> None:

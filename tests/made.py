@@ -1,0 +1,30 @@
+"""A recording's metadata and a robot's state with usual values, for tests that care for a few of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from go1exp import robot
+from go1exp.logs.recording import Meta
+from go1exp.robot.messages import LowState
+
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+
+
+def meta(joints: Sequence[str] = robot.JOINTS, **about: Any) -> Meta:
+    """Return metadata of a simulated Go1 at 500 Hz whose level trunk is held, with changes."""
+    usual: dict[str, Any] = {"robot": "go1", "rate_hz": 500.0, "base": "fixed", "base_quat": LEVEL}
+    usual |= {"kp": None, "kd": None, "tau_limit": None, "excitation": None, "episode": "one", "repeat_of": None}
+    usual |= {"source": "simulated", "tool": "test", "versions": {}, "notes": ""}
+    return Meta(joints=tuple(joints), **(usual | about))
+
+
+def low_state(t: float = 0.0, **changes: Any) -> LowState:
+    """Return what a robot reports that stands at rest in the nominal stance, with changes."""
+    usual: dict[str, Any] = {"joint_pos": robot.NOMINAL_STANCE.copy(), "joint_vel": np.zeros(12)}
+    usual |= {"joint_torque": np.zeros(12), "imu_quat": np.array(LEVEL), "imu_gyro": np.zeros(3)}
+    usual |= {"imu_acc": np.array([0.0, 0.0, 9.81]), "foot_force": np.full(4, 30.0)}
+    return LowState(t, **(usual | changes))
