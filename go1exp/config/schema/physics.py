@@ -3,15 +3,33 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
-from go1exp.config.schema.registry import STRICT, as_json
+from go1exp.config.schema.registry import Strict, as_json
+
+
+class Engine(Strict):
+    """What the settings of every engine tell."""
+
+    @property
+    def on_gpu(self) -> bool:
+        """Whether its tensors are on a GPU."""
+        return False
+
+    @property
+    def captures(self) -> bool:
+        """Whether work on its tensors is recorded once and replayed."""
+        return False
+
+    def as_reference(self) -> CpuBackend:
+        """Return the settings of the engine that policies are evaluated on, wherever they were trained: MuJoCo's."""
+        return CpuBackend("cpu", threads=0)
 
 
 @dataclass(frozen=True)
-class CpuBackend:
+class CpuBackend(Engine):
     """MuJoCo's batch on a thread pool.
 
     Attributes:
@@ -19,23 +37,16 @@ class CpuBackend:
         threads: threads of the physics; 0 takes all cores.
     """
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
-
-    on_gpu: ClassVar[bool] = False
-    """Whether its tensors are on a GPU."""
-    captures: ClassVar[bool] = False
-    """Whether work on its tensors is recorded once and replayed."""
-
     name: Literal["cpu"]
     threads: Annotated[int, Field(ge=0)]
 
     def as_reference(self) -> CpuBackend:
-        """Return the settings of the engine that policies are judged on, wherever they were trained: MuJoCo's own."""
+        """Return these settings, with their threads."""
         return self
 
 
 @dataclass(frozen=True)
-class WarpBackend:
+class WarpBackend(Engine):
     """MuJoCo Warp on one GPU.
 
     Attributes:
@@ -47,8 +58,6 @@ class WarpBackend:
         njmax: constraint rows of one environment: 4 for each contact, one for each joint at its stop or with dry
             friction.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     name: Literal["warp"]
     device: Annotated[str, Field(pattern=r"^(cpu|cuda(:\d+)?)$")]
@@ -63,38 +72,27 @@ class WarpBackend:
 
     @property
     def on_gpu(self) -> bool:
-        """Whether its tensors are on a GPU."""
+        """Whether the device is a GPU."""
         return self.device != "cpu"
 
     @property
     def captures(self) -> bool:
-        """Whether work on its tensors is recorded once and replayed."""
+        """Whether a CUDA graph is used."""
         return self.graph
-
-    def as_reference(self) -> CpuBackend:
-        """Return the settings of the engine that policies are judged on, wherever they were trained: MuJoCo's own."""
-        return CpuBackend("cpu", threads=0)
 
 
 @dataclass(frozen=True)
-class PhysxBackend:
-    """PhysX 5 on the processor, in single precision: it judges policies that were made with MuJoCo, and trains none.
+class PhysxBackend(Engine):
+    """PhysX 5 on the processor, in single precision: for evaluating policies trained with MuJoCo, not for training.
 
     Attributes:
         name: ``physx``.
         threads: threads of the physics; 0 takes all cores. Robots are solved one by one: the same bits at any number.
         solver: ``tgs``, which divides a step by its iterations, or ``pgs``, which repeats the whole step.
         position_iterations: iterations of the solver in a physics step.
-        velocity_iterations: iterations after those, for speeds alone.
+        velocity_iterations: iterations after those, for velocities alone.
         contact_offset: distance at which shapes are looked at for a contact, m; they touch at 0.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
-
-    on_gpu: ClassVar[bool] = False
-    """Whether its tensors are on a GPU."""
-    captures: ClassVar[bool] = False
-    """Whether work on its tensors is recorded once and replayed."""
 
     name: Literal["physx"]
     threads: Annotated[int, Field(ge=0)]
@@ -102,10 +100,6 @@ class PhysxBackend:
     position_iterations: Annotated[int, Field(ge=1, le=255)]
     velocity_iterations: Annotated[int, Field(ge=0, le=255)]
     contact_offset: Annotated[float, Field(gt=0, le=0.1)]
-
-    def as_reference(self) -> CpuBackend:
-        """Return the settings of the engine that policies are judged on, wherever they were trained: MuJoCo's own."""
-        return CpuBackend("cpu", threads=0)
 
 
 BackendConfig = CpuBackend | WarpBackend | PhysxBackend
@@ -115,7 +109,7 @@ BACKENDS: dict[str, type] = {"cpu": CpuBackend, "warp": WarpBackend, "physx": Ph
 
 
 @dataclass(frozen=True)
-class ContactConfig:
+class ContactConfig(Strict):
     """Contact of the feet with the ground (docs/contact.md).
 
     Attributes:
@@ -123,8 +117,6 @@ class ContactConfig:
         cone: friction cone: ``elliptic``, the same in every direction, or ``pyramidal``, weaker by 0.71 on diagonals.
         impratio: how much harder friction is than the normal force; more means less creep of a loaded foot.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     time_constant: Annotated[float, Field(ge=0.002, le=0.1)]
     cone: Literal["pyramidal", "elliptic"]

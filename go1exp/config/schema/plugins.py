@@ -2,7 +2,7 @@
 
 A configuration names them (``plugins=[my_terms.py, my_package]``), the environment variable ``GO1EXP_PLUGINS`` does for
 every command, and an installed package can offer itself (entry point group ``go1exp.extend``): it is imported when a
-term is wanted that nobody else has. ``docs/extending.md`` is the users' page.
+term is requested that is not registered. ``docs/extending.md`` is the users' page.
 
 The registry always holds the terms of the configuration at hand and not those of the one before: ``use`` says which.
 A file is executed once for each content that it has, however often it is named.
@@ -18,7 +18,7 @@ import importlib.util
 import os
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -133,9 +133,7 @@ def use(wanted: Any = ()) -> list[Plugin]:
             chosen.setdefault(module, (name, file))
         except ConfigError as error:
             problems += error.problems
-    for module in [m for m in _active if m not in chosen]:
-        for entry in _active.pop(module).entries:
-            registry.remove(entry)
+    _keep_active(chosen)
     for module, (name, file) in chosen.items():
         try:
             _activate(module, name, file)
@@ -153,9 +151,7 @@ def restored() -> Iterator[None]:
     try:
         yield
     finally:
-        for module in [m for m in _active if m not in before]:
-            for entry in _active.pop(module).entries:
-                registry.remove(entry)
+        _keep_active(before)
         for module, plugin in before.items():
             _activate(module, plugin.name, plugin.file)
 
@@ -185,8 +181,7 @@ def installed() -> list[Plugin]:
 
 def origin(entry: Entry) -> str | None:
     """Return the plugin that a member is from, as it was asked for; None for one of this package."""
-    every = [*_active.values(), *(_installed or {}).values()]
-    return next((p.name for p in every if any(e is entry for e in p.entries)), None)
+    return next((p.name for p in in_force() if any(e is entry for e in p.entries)), None)
 
 
 def in_force() -> list[Plugin]:
@@ -219,6 +214,13 @@ def _module(name: str) -> tuple[str, Path | None]:
         return f"go1exp_plugin_{path.stem}_{sha256(path)[:12]}", path.resolve()
     except OSError as error:
         raise ConfigError([f"{KEY}: {name}: {error.strerror}"]) from None
+
+
+def _keep_active(modules: Collection[str]) -> None:
+    """Put out of force the plugins of other modules."""
+    for module in [m for m in _active if m not in modules]:
+        for entry in _active.pop(module).entries:
+            registry.remove(entry)
 
 
 def _activate(module: str, name: str, file: Path | None) -> None:
@@ -276,7 +278,7 @@ def _import(module: str, name: str, file: Path | None) -> Plugin:
         for other in [m for m in sys.modules if m.split(".")[0] == root and m not in before]:
             del sys.modules[other]
         raise ConfigError([f"{KEY}: {_reason(error, module, name, file)}"]) from error
-    by_module = [e for e in registry.foreign() if _within(e.target.__module__, module)]  # imported by someone before
+    by_module = [e for e in registry.foreign() if f"{e.target.__module__}.".startswith(f"{module}.")]  # imported before
     entries = tuple({id(e): e for e in [*by_module, *new]}.values())  # entries hold mappings: not hashable
     if not entries:
         raise ConfigError(
@@ -284,10 +286,6 @@ def _import(module: str, name: str, file: Path | None) -> Plugin:
         )
     _loaded[module] = Plugin(name, module, file, content, entries)
     return _loaded[module]
-
-
-def _within(name: str, module: str) -> bool:
-    return name == module or name.startswith(f"{module}.")
 
 
 def _reason(error: BaseException, module: str, name: str, file: Path | None) -> str:
@@ -307,8 +305,4 @@ def _reason(error: BaseException, module: str, name: str, file: Path | None) -> 
     return f"{inside[-1].filename}:{inside[-1].lineno}: {type(error).__name__}: {text}"
 
 
-def _search() -> None:
-    installed()
-
-
-registry.MORE.append(_search)  # when a term is wanted that nobody has
+registry.MORE.append(installed)  # when a term is requested that is not registered

@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Annotated, Any, TypeVar, get_type_hints
+from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, create_model
 
@@ -30,6 +30,13 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 """Pydantic settings of every schema: no unknown key, no silent conversion between types, finite numbers only."""
+
+
+class Strict:
+    """Base of dataclasses that pydantic checks by the rules of ``STRICT``."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
@@ -64,7 +71,7 @@ def within(low: float, high: float, unit: str) -> AfterValidator:
 
 
 Speed = Annotated[float, within(-100.0, 100.0, "(m/s or rad/s)")]
-"""A velocity, m/s, or turning rate, rad/s: no robot reaches the ends, and squares stay finite far beyond them."""
+"""A velocity, m/s, or yaw rate, rad/s: no robot reaches the ends, and squares stay finite far beyond them."""
 SpeedRange = Annotated[tuple[Speed, Speed], AfterValidator(ordered)]
 
 
@@ -218,7 +225,7 @@ class Entry:
 
 _REGISTRY: dict[str, dict[str, Entry]] = {}
 
-MORE: list[Callable[[], None]] = []
+MORE: list[Callable[[], object]] = []
 """Called when a name is not known, to register what else is installed (``config/schema/plugins.py``)."""
 
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
-from go1exp.config.schema.registry import STRICT, Count, CountOrZero, Fraction, NonNegative, Positive
+from go1exp.config.schema.registry import Count, CountOrZero, Fraction, NonNegative, Positive, Strict
 
 
 @dataclass(frozen=True)
-class PPOConfig:
+class PPOConfig(Strict):
     """The learner. Its numbers in ``conf/ppo`` are the paper's (section III-A) and, where it prints none, Isaac Lab's.
 
     Attributes:
@@ -45,8 +45,6 @@ class PPOConfig:
         symmetry: join each minibatch with its mirror image, left for right (Mittal et al., arXiv 2403.04359).
     """
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
-
     num_envs: Count
     iterations: Count
     steps: Count
@@ -74,7 +72,7 @@ class PPOConfig:
 
 
 @dataclass(frozen=True)
-class WandbConfig:
+class WandbConfig(Strict):
     """Weights & Biases.
 
     Attributes:
@@ -88,8 +86,6 @@ class WandbConfig:
         artifacts: log newest and best checkpoint, and the bundle of go1exp export, when training ends.
     """
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
-
     project: Annotated[str, Field(min_length=1)]
     mode: Literal["offline", "online"]
     group: str | None
@@ -101,7 +97,7 @@ class WandbConfig:
 
 
 @dataclass(frozen=True)
-class LoggerConfig:
+class LoggerConfig(Strict):
     """Where metrics go besides the progress bar.
 
     Attributes:
@@ -110,23 +106,19 @@ class LoggerConfig:
         wandb: Weights & Biases, or null for none.
     """
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
-
     csv: bool
     tensorboard: bool
     wandb: WandbConfig | None
 
 
 @dataclass(frozen=True)
-class CheckpointConfig:
+class CheckpointConfig(Strict):
     """When checkpoints are written.
 
     Attributes:
         every: iterations from checkpoint to checkpoint.
         keep: newest checkpoints that stay.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     every: Count
     keep: Count
@@ -140,14 +132,14 @@ EVALUATED = "eval/"
 
 
 @dataclass(frozen=True)
-class EvalDuring:
+class EvalDuring(Strict):
     """Evaluation in a process of its own, on the CPU engine, while training goes on; the best policy is kept.
 
     Attributes:
         every: iterations from evaluation to evaluation; 0 for none.
-        x: forward velocities that robots are told, m/s.
+        x: commanded forward velocities, m/s.
         y: velocities to the left, m/s.
-        yaw: turning rates, rad/s.
+        yaw: yaw rates, rad/s.
         episodes: robots of each command.
         duration_s: length of an episode, s.
         settle_s: time at its start that does not count for tracking, s.
@@ -155,8 +147,6 @@ class EvalDuring:
         randomize: randomise robots and starts as in training.
         seed: seed of everything random, the same each time.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     every: CountOrZero = 0
     x: tuple[float, ...] = (-0.5, 0.5, 1.0)
@@ -171,16 +161,14 @@ class EvalDuring:
 
 
 @dataclass(frozen=True)
-class VideoDuring:
-    """Films in the same process.
+class VideoDuring(Strict):
+    """Videos in the same process.
 
     Attributes:
-        every: iterations from film to film; 0 for none.
-        seconds: length of a film, s.
+        every: iterations from video to video; 0 for none.
+        seconds: length of a video, s.
         velocity: commanded velocity in it, x m/s, y m/s, yaw rad/s.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     every: CountOrZero = 0
     seconds: Positive = 6.0
@@ -188,7 +176,7 @@ class VideoDuring:
 
 
 @dataclass(frozen=True)
-class StopRule:
+class StopRule(Strict):
     """When a training ends before its last iteration.
 
     Attributes:
@@ -198,8 +186,6 @@ class StopRule:
         patience: iterations without a better value than before after which training ends; null for none.
         least: by how much a value must be better to count.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     figure: str | None = None
     better: Literal["higher", "lower"] = "higher"
@@ -224,7 +210,7 @@ Value = float | tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Trigger:
+class Trigger(Strict):
     """A training metric that starts a ramp.
 
     Attributes:
@@ -233,8 +219,6 @@ class Trigger:
         above: or when it is at least this.
         iterations: iterations over which the mean is taken.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     measure: str
     below: float | None = None
@@ -252,7 +236,7 @@ class Trigger:
 
 
 @dataclass(frozen=True)
-class Ramp:
+class Ramp(Strict):
     """One setting that moves linearly from one value to another while a policy is trained.
 
     Attributes:
@@ -265,8 +249,6 @@ class Ramp:
         unit: steps of all robots together, or iterations, which suit small and large batches alike.
         optional: leave the ramp out of a task without this setting, such as a delay with actuator=pd.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     path: Annotated[str, Field(alias="set")]
     first: Annotated[Value, Field(alias="from")]

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
-from go1exp.config.schema.registry import STRICT, Duration, Fraction, NonNegative
+from go1exp.config.schema.registry import Duration, Fraction, NonNegative, Strict
 from go1exp.config.schema.settings import settings
 
 
 @dataclass(frozen=True)
-class SimConfig:
+class SimConfig(Strict):
     """Setup of the simulated robot.
 
     Attributes:
@@ -24,8 +24,6 @@ class SimConfig:
         feet: unit of the foot sensors, newton, or raw: counts with zeros and scales drawn by seed, as on a robot.
         seed: seed of noise, loss and random effects.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     start: Literal["standing", "lying", "suspended"] = "standing"
     noise: NonNegative = 1.0
