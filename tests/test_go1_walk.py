@@ -29,7 +29,7 @@ from go1exp.deploy.runtime.bundle import load
 from go1exp.deploy.runtime.commands import CommandConfig
 from go1exp.deploy.runtime.estimate import BOTH, TORQUE, KalmanEstimator, settings
 from go1exp.deploy.runtime.go1_check import Bounds, Observed, evaluated, listen
-from go1exp.deploy.runtime.job import CheckJob, Job, run_check, run_job
+from go1exp.deploy.runtime.job import Job, run_check, run_job
 from go1exp.deploy.runtime.launch import RobotError
 from go1exp.deploy.runtime.udp import Go1Link
 from go1exp.deploy.runtime.walk import Plan
@@ -375,8 +375,8 @@ def test_a_check_asks_for_no_torque_and_calibrates_feet_from_lying_and_standing(
     for start in ("standing", "lying", "standing"):
         made = server(bundle, start=start, feet="raw", seed=3, noise=0.1)
         with living(made) as heard:
-            look = CheckJob(robot.JOINTS, robot.JOINT_POS_LIMITS, feet, f"127.0.0.1:{made.port}")
-            assert run_check(look, said.append) == 0, said[-4:]
+            look = robot.JOINTS, robot.JOINT_POS_LIMITS, feet, f"127.0.0.1:{made.port}"
+            assert run_check(*look, said.append) == 0, said[-4:]
         assert len(heard) > 5
         assert set(heard) == {wire.IDLE}
         assert not made.robot.commanded
@@ -424,11 +424,11 @@ def test_nobody_there_is_said_in_a_line(tmp_path: Path, monkeypatch: pytest.Monk
     said: list[str] = []
     with speakers(1) as (silent,):
         address = "{}:{}".format(*silent.getsockname())
-        assert run_check(CheckJob(robot.JOINTS, robot.JOINT_POS_LIMITS, tmp_path / "f", address), said.append) == 1
+        assert run_check(robot.JOINTS, robot.JOINT_POS_LIMITS, tmp_path / "f", address, said.append) == 1
     assert said[1].startswith("problem: no robot: 0 states in 0.1 s; nothing arrived")
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(RobotError, match=r"address=here: must be HOST:PORT, such as 192\.168\.123\.10:8007"):
-        run_check(CheckJob(robot.JOINTS, robot.JOINT_POS_LIMITS, tmp_path / "f", "here"), said.append)
+        run_check(robot.JOINTS, robot.JOINT_POS_LIMITS, tmp_path / "f", "here", said.append)
 
 
 def heard_of(**changes: Any) -> Observed:

@@ -239,9 +239,6 @@ def spinner(total: int, what: str) -> Callable[[int, int], None]:
 MEANING = "files and packages with terms of your own, such as [my_terms.py] (docs/extending.md)"
 """Of the key ``plugins``, for the help."""
 
-BY_CONFIGURATION = ("train",)
-"""Verbs whose configuration is parsed with its plugins; the others have the key for themselves."""
-
 
 def begin(verb: str, container: dict[str, Any]) -> dict[str, Any]:
     """Load the plugins of a command line, and those of the run that it names; return the rest of the configuration.
@@ -249,7 +246,7 @@ def begin(verb: str, container: dict[str, Any]) -> dict[str, Any]:
     Raises:
         ConfigError: if a plugin is missing, fails, or registers nothing.
     """
-    if verb in BY_CONFIGURATION:
+    if verb == "train":  # whose configuration is parsed with its plugins
         plugins.begin()
         return container
     wanted = plugins.names(container.get(plugins.KEY))

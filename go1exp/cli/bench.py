@@ -43,13 +43,13 @@ class BenchSettings:
     out: str | None
 
 
-BARS = {
+GOALS = {
     "env_over_bare": (0.75, "environment over bare mujoco.batch of the same model"),
     "env_over_subproc": (5.0, "environment over SB3's SubprocVecEnv of our Go1Env on all cores"),
     "train_over_env": (0.35, "end-to-end training over environment"),
     "net_over_pd": (0.65, "environment with actuator=net over actuator=pd"),
     "effects_over_none": (0.80, "environment with five joint effects over none"),
-    "record_s": (20.0, "seconds to record 60 s of a hung robot with three gain sets (at most)"),
+    "record_s": (20.0, "seconds to record 60 s of a suspended robot with three gain sets (at most)"),
     "gpu_env_over_bare": (0.70, "environment over bare mujoco-warp of the same model"),
     "gpu_net_over_bare": (0.55, "the same with an actuator net"),
     "gpu_train_over_env": (0.65, "training over environment"),
@@ -110,7 +110,7 @@ def _task(container: dict[str, Any]) -> None:
     about = " ".join(settings.overrides) or "defaults"
     print(f"suite={settings.suite} N={settings.num_envs} ({about})\n{machine()}\n")
     for name, value in figures.items():
-        goal, meaning = BARS.get(name, (None, name.replace("_per_s", " per second").replace("_", " ")))
+        goal, meaning = GOALS.get(name, (None, name.replace("_per_s", " per second").replace("_", " ")))
         aim = "" if goal is None else f"goal {goal:g}"
         print(f"{value:12,.2f}  {aim:10} {meaning}")
     if settings.out:

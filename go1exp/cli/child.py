@@ -19,7 +19,7 @@ PR_SET_PDEATHSIG = 1
 """``prctl(2)``: the signal to get when the parent dies."""
 
 PATIENCE_S = 60.0
-"""Time for which an older process of the same job may save its checkpoint; then the lock is somebody else's, s."""
+"""Time for which an older process of the same job may save its checkpoint; then the lock belongs to another, s."""
 
 
 def end_with(parent: int) -> None:
@@ -35,7 +35,7 @@ def end_with(parent: int) -> None:
 
 
 def wait_for_older_one(run: Path) -> None:
-    """Wait until nobody trains in ``run``: a launcher that lost sight of a process may have started this one for it."""
+    """Wait until no process trains in ``run``: a launcher that lost one may have started this one in its place."""
     limit = time.monotonic() + PATIENCE_S
     while run_state.in_use(run) and time.monotonic() < limit:
         time.sleep(0.2)

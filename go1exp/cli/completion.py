@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -172,7 +172,7 @@ def _as_bash_inserts_them(words: Sequence[str], line: str, breaks: str) -> list[
 
 
 def _by_position(verb: str, word: str, before: Sequence[str], folders: Sequence[Path]) -> list[str]:
-    """Complete a word that is given by its place alone."""
+    """Complete a word that is given by position alone."""
     keys = POSITIONAL.get(verb, ())
     place = sum(
         "=" not in given and not given.startswith(("-", "~")) and option not in VALUED
@@ -227,13 +227,14 @@ def _members(verb: str, key: str, value: str, before: Sequence[str], folders: Se
             answers += [a for a in _paths(value, (".yaml", ".yml")) if a not in answers] if value else []
         return answers
     if last in POLICIES:
-        answers += [name for name in _shipped() if name.startswith(value)]
+        shipped = sorted(file.parent.name for file in (data_root() / "assets/policies").glob("*/config.yaml"))
+        answers += [name for name in shipped if name.startswith(value)]
     if last in WORDS and (key != "robot" or verb == "deploy"):
         answers += [name for name in WORDS[last] if name.startswith(value)]
     if (verb, key) == ("list", "group"):
         answers += [name for name in _listed(folders) if name.startswith(value)]
     if last in RUNS:
-        answers += _paths(value, (), is_leaf=_is_run)
+        answers += _paths(value, (), runs=True)
     elif last in SUFFIXES and not (last == "command" and not value):
         places = [*(_checkpoints(before) if last == "checkpoint" else ()), *_paths(value, SUFFIXES[last])]
         answers += [place for place in places if place.startswith(value)]
@@ -252,25 +253,17 @@ def _levels(names: Sequence[str] | dict[str, Path], value: str) -> list[str]:
     return list(dict.fromkeys(levels))
 
 
-def _paths(value: str, suffixes: Sequence[str], is_leaf: Callable[[Path], bool] | None = None) -> Iterator[str]:
-    """Complete a path: folders with a slash, files with one of the endings; what ``is_leaf`` is has no slash."""
+def _paths(value: str, suffixes: Sequence[str], runs: bool = False) -> Iterator[str]:
+    """Complete a path: folders with a slash, files with one of the endings; with ``runs``, run folders without one."""
     head, slash, tail = value.rpartition("/")
     folder = Path(head + slash).expanduser()
     for path in sorted(folder.iterdir(), key=lambda p: p.name) if folder.is_dir() else ():
         if not path.name.startswith(tail) or (path.name.startswith(".") and not tail.startswith(".")):
             continue
         if path.is_dir():
-            yield f"{head}{slash}{path.name}" + ("" if is_leaf and is_leaf(path) else "/")
+            yield f"{head}{slash}{path.name}" + ("" if runs and (path / "config.yaml").is_file() else "/")
         elif suffixes and path.name.endswith(tuple(suffixes)):
             yield f"{head}{slash}{path.name}"
-
-
-def _is_run(folder: Path) -> bool:
-    return (folder / "config.yaml").is_file()
-
-
-def _shipped() -> list[str]:
-    return sorted(file.parent.name for file in (data_root() / "assets/policies").glob("*/config.yaml"))
 
 
 def _checkpoints(before: Sequence[str]) -> list[str]:

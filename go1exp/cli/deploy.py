@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -124,7 +125,7 @@ def _task(container: dict[str, Any]) -> int:
         feet=settings.feet,
     )
     try:
-        return run_job(job, lambda line: print(line, flush=True))
+        return run_job(job, partial(print, flush=True))
     except RefusedError as error:
         raise ConfigError(error.problems) from None
     finally:
@@ -150,13 +151,13 @@ def _refuse_misfits(settings: DeploySettings, other: dict[str, Any], controlled:
 def _check(settings: DeploySettings) -> int:
     """Check the robot."""
     from go1exp import robot
-    from go1exp.deploy.runtime.job import CheckJob, run_check
+    from go1exp.deploy.runtime.job import run_check
 
     if settings.robot != "go1":
         raise ConfigError([f"check = true: is for robot=go1, not robot={settings.robot}"])
     feet = Path(settings.feet or Path(settings.out) / "feet.json")
-    job = CheckJob(robot.JOINTS, robot.JOINT_POS_LIMITS, feet, settings.address)
-    return run_check(job, lambda line: print(line, flush=True))
+    say = partial(print, flush=True)
+    return run_check(robot.JOINTS, robot.JOINT_POS_LIMITS, feet, settings.address, say)
 
 
 def _rate(settings: DeploySettings, controller: MpcSettings | None) -> float | None:

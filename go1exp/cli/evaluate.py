@@ -13,7 +13,7 @@ from pydantic import Field
 from go1exp.cli import subjects
 from go1exp.cli.app import App, parse, spinner
 from go1exp.cli.places import checkpoint_file, trained, writable
-from go1exp.cli.subjects import Named, agent, driven, named
+from go1exp.cli.subjects import Named, agent
 from go1exp.config.choices import config_folder, load
 from go1exp.config.schema import settings as schema
 from go1exp.config.schema.registry import ConfigError, Count, Duration, FolderName, NonNegative, Speed, Term, bind_list
@@ -33,7 +33,7 @@ class Grid:
     Attributes:
         x: forward velocities, m/s.
         y: velocities to the left, m/s.
-        yaw: turning rates, rad/s.
+        yaw: yaw rates, rad/s.
         cross: every combination of the three axes; false: one axis at a time, the others zero.
     """
 
@@ -49,7 +49,7 @@ class EvalSettings:
 
     Attributes:
         controller: what moves the robots: policy, the one of run or policy, or mpc.
-        run: run folder to judge; or give policy.
+        run: run folder to evaluate; or give policy.
         policy: name of a policy that comes with the package, such as paper, in place of run.
         bundle: file that go1exp export wrote, in place of run; not for protocol=grid.
         checkpoint: file of the run; null takes the newest.
@@ -66,7 +66,7 @@ class EvalSettings:
         physics_dt: another physics step, s, such as 0.00125 for policy_dt=0.0025; null keeps that of training.
         measures: gait and contact measures by name (go1exp list measure), [] for none; null takes all of them. With
             parameters as {slip_share: {speed: 0.1}}.
-        delay_margin: also run the grid with targets 10, 20, 30 and 40 ms late, until a robot falls.
+        delay_margin: also run the grid with targets delayed by 10, 20, 30 and 40 ms, until a robot falls.
         seed: seed of everything random.
         out: JSON file; null writes eval.json in the run folder (of a shipped policy paper_eval.json here).
         folder: for the files of other protocols than the grid; null takes protocols in the run folder (of a shipped
@@ -245,52 +245,49 @@ def _measures(given: Any) -> list[Term]:
 
 
 @dataclass(frozen=True)
-class _Judged:
-    """What an evaluation is of, beside its policy: the robot's parts that differ, the engine, another controller."""
+class _Conditions:
+    """Conditions of an evaluation: the robot's parts that differ, the engine, another controller than a policy."""
 
     other: dict[str, Any]
     engine: BackendConfig
     controller: MpcSettings | None
 
 
-def _protocols(settings: Any, protocols: list[Any], judged: _Judged) -> None:
+def _protocols(settings: Any, protocols: list[Any], conditions: _Conditions) -> None:
     """Play what is not the grid."""
-    refuse_rates(protocols, judged.controller.name if judged.controller else None, settings.policy_dt)
-    if judged.controller is None:
-        subject = named(settings.run, settings.policy, settings.bundle, settings.checkpoint, "protocols")
-    else:
-        subject = driven(judged.controller, settings.run, settings.policy, settings.bundle, "protocols")
+    refuse_rates(protocols, conditions.controller.name if conditions.controller else None, settings.policy_dt)
+    subject = subjects.subject_of(settings, conditions.controller, "protocols")
     folder = Path(settings.folder or subject.folder)
     if folder.exists() and not folder.is_dir():
         raise ConfigError([f"folder = {str(folder)!r}: is a file"])
     from go1exp.evaluate.protocol.playing import Rates
 
-    rates = Rates(settings.seed, settings.policy_dt, settings.physics_dt, judged.engine)
-    play_protocols(protocols, subject, folder, judged.other, rates)
+    rates = Rates(settings.seed, settings.policy_dt, settings.physics_dt, conditions.engine)
+    play_protocols(protocols, subject, folder, conditions.other, rates)
 
 
 def _task(container: dict[str, Any]) -> None:
 
-    judge, container = subjects.split_engine(container)
+    engine, container = subjects.split_engine(container)
     other, container = subjects.split_robot(container)
     choice = {"protocol": container.pop("protocol")}
     settings = parse(EvalSettings, container)
     protocols, grid_too = chosen_protocols({**container, **choice}, load(config_folder() / "eval.yaml"))
-    judged = _Judged(other, judge, subjects.chosen_controller(settings.controller))
+    conditions = _Conditions(other, engine, subjects.chosen_controller(settings.controller))
     measures = _measures(settings.measures)
-    if judged.controller is not None and settings.checkpoint:
+    if conditions.controller is not None and settings.checkpoint:
         raise ConfigError([f"checkpoint = {settings.checkpoint!r}: is of a policy; controller=mpc has none"])
     if not protocols and settings.folder is not None:
         raise ConfigError([f"folder = {settings.folder!r}: is of other protocols; the file of protocol=grid is out="])
     if grid_too:
         _check_grid(settings)
-    subject = _of_grid(settings, judged.controller) if grid_too else None
+    subject = _of_grid(settings, conditions.controller) if grid_too else None
     if subject:
         writable_file(subject[2])
     if protocols:
-        _protocols(settings, protocols, judged)
+        _protocols(settings, protocols, conditions)
     if subject:
-        _grid(settings, measures, judged, subject)
+        _grid(settings, measures, conditions, *subject)
 
 
 def _check_grid(settings: Any) -> None:
@@ -302,38 +299,37 @@ def _check_grid(settings: Any) -> None:
         raise ConfigError(["grid: with cross=true every axis needs at least one value, such as grid.yaw=[0.0]"])
 
 
-def _of_grid(settings: Any, controller: MpcSettings | None) -> tuple[Path | None, Path | None, Path]:
-    """Return run (None for another controller), checkpoint and report; raise ConfigError if they are not there."""
+def _of_grid(settings: Any, controller: MpcSettings | None) -> tuple[Path, Path | None, Path]:
+    """Return run, checkpoint and report; raise ConfigError if they are not there."""
     if controller is not None:
-        return None, None, subjects.controller_conditions(settings.run, settings.policy, "eval.json", settings.out)[1]
+        run, out = subjects.controlled(settings.run, settings.policy, "eval.json", settings.out)
+        return run, None, out
     run, out = trained(settings.run, settings.policy, "eval.json", settings.out)
     return run, checkpoint_file(run, settings.checkpoint), out
 
 
-def _grid(settings: Any, measures: list[Term], judged: _Judged, subject: tuple[Path | None, Path | None, Path]) -> None:
+def _grid(
+    settings: Any, measures: list[Term], conditions: _Conditions, run: Path, checkpoint: Path | None, out: Path
+) -> None:
     """Play the grid of constant commands."""
     from go1exp.evaluate import criteria, rows, table
     from go1exp.evaluate.rollout import EvalConfig, delay_margin, evaluate, grid
     from go1exp.train.policy import load_run
 
-    run, checkpoint, out = subject
     policy, make = None, None
-    if run is not None:
+    if conditions.controller is None:
         of_run, policy, about = load_run(run, checkpoint)
         task = of_run.task
     else:
-        assert judged.controller is not None
-        task, _ = subjects.controller_conditions(settings.run, settings.policy, "eval.json", settings.out)
-        make, about = (
-            subjects.controller_maker(judged.controller, task),
-            {"controller": dataclasses.asdict(judged.controller)},
-        )
+        task = subjects.task_of_run(run)
+        make = subjects.controller_maker(conditions.controller, task)
+        about = {"controller": dataclasses.asdict(conditions.controller)}
     commands = grid(settings.grid.x, settings.grid.y, settings.grid.yaw, settings.grid.cross)
-    config = EvalConfig.from_settings(settings, commands=commands, engine=judged.engine)
-    task = subjects.with_robot(task, judged.other)
+    config = EvalConfig.from_settings(settings, commands=commands, engine=conditions.engine)
+    task = subjects.with_robot(task, conditions.other)
     report = {
         "policy": about,
-        "robot": subjects.robot_as_data(judged.other),
+        "robot": subjects.robot_as_data(conditions.other),
         **evaluate(task, policy, config, spinner(1, "evaluating"), measures, make),
     }
     if settings.delay_margin:

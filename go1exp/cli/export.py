@@ -150,7 +150,7 @@ def summary(bundle: Bundle) -> list[tuple[str, str]]:
         ("file", f"{bundle.source}, SHA-256 {bundle.seal}"),
         ("robot", about.robot),
         ("trained", f"{about.trained.num_timesteps / 1e6:.2f} M steps, {about.trained.checkpoint}, commit {commit}"),
-        ("rates", f"policy {1 / about.policy_dt:g} Hz, drives {1 / about.physics_dt:g} Hz (in training)"),
+        ("rates", f"policy {1 / about.policy_dt:g} Hz, actuators {1 / about.physics_dt:g} Hz (in training)"),
         ("action", f"target = nominal stance + {about.action_scale:g} rad x action, cut at +-{about.action_clip:g}"),
         ("commands", ranges or "unknown"),
         ("estimator", estimator(about.estimator)),

@@ -86,7 +86,7 @@ def with_logs(container: dict[str, Any]) -> dict[str, Any]:
     words, stage = ("all", *STAGES, *SUBVERBS["gap"]), str(container.get("stage", "all"))
     is_verb = nearest(stage, words, 1) in [[verb] for verb in SUBVERBS["gap"]]
     if stage not in words and (is_verb or container.get("logs") == MISSING):
-        raise ConfigError([unknown_name("stage", stage, words, "stage")])  # other words are told with all problems
+        raise ConfigError([unknown_name("stage", stage, words, "stage")])
     if container.get("stage") in ("report", "view") and container.get("logs") == MISSING:
         return {**container, "logs": []}
     return container
@@ -187,7 +187,7 @@ def _check(recordings: list[Recording], robot: Robot, settings: GapVerb) -> int:
 
 
 def _localise(recordings: list[Recording], robot: Robot, settings: GapVerb) -> int:
-    """Print where the plain model is wrong."""
+    """Print where the nominal model is wrong."""
     from go1exp.gap.report import localisation_text
     from go1exp.gap.stages.check import check
 
@@ -254,14 +254,14 @@ def _status(result: GapResult, out: Path) -> int:
     return DOES_NOT_HOLD if certified and not proof["holds"] else result.exit_code
 
 
-def _print_next(lacking: dict[str, Any], robot: Robot, file: Path, contact: ContactConfig | None = None) -> None:
-    """Say how to train with the effects in ``file``, if there are any, and a robot that is trained.
+def _print_next(effects: dict[str, Any], robot: Robot, file: Path, contact: ContactConfig | None = None) -> None:
+    """Print how to train with the effects in ``file``, if there are any, and a robot that is trained.
 
-    Training has MuJoCo's own contact by default; with another one, it is told.
+    The command names a contact that is not MuJoCo's own, which is the default of training.
     """
     from go1exp.robot import JOINTS
 
-    if not lacking:
+    if not effects:
         print(f"nothing is certified: {file} is empty, and training with it would change nothing")
     elif robot.joints == JOINTS:
         print(f"now: {command('train', settings={'effect': file, **_contact_choice(contact)})}")

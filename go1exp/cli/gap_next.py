@@ -74,7 +74,7 @@ class GapLoopSettings(RecordingConfig):
 
 
 NOT_SEPARABLE = 16
-"""Exit status if no recording separates what is left."""
+"""Exit status if no recording distinguishes the remaining explanations."""
 
 TARGETS, ANSWER = "next.csv", "next.json"
 """Names of the files in the output folder."""

@@ -6,7 +6,6 @@ verb does and its examples from ``hydra.help`` in ``conf/VERB.yaml``.
 
 from __future__ import annotations
 
-import math
 import shutil
 import sys
 import textwrap
@@ -53,7 +52,8 @@ def show(verb: str, title: str, arguments: Sequence[str]) -> None:
     keys = _flat(container)
     sections = {key.rpartition(".")[0] for key in keys}
     strange = [word for word in words if word not in {*groups, *keys, *sections}]
-    if len(strange) > _positions(verb):
+    positional = POSITIONAL.get(verb, ())  # words for themselves, as the file in ``go1exp deploy walk.zip --help``
+    if len(strange) > len(positional) and not {*positional} & {*LISTS}:
         _refuse(title, strange[-1], [*groups, *keys])
     named = next((group for word in words if (group := word.partition(".")[0]) in groups), None)
     print("\n".join(_group_page(title, named, groups, container, folders) if named else _page(verb, title, container)))
@@ -66,12 +66,6 @@ def _words(arguments: Sequence[str]) -> list[str]:
         for before, word in zip(["", *arguments], arguments, strict=False)
         if before not in VALUED and not word.startswith(("-", "~")) and "=" not in word
     ]
-
-
-def _positions(verb: str) -> float:
-    """Return how many words may stand for themselves, as the file in ``go1exp deploy walk.zip --help`` does."""
-    keys = POSITIONAL.get(verb, ())
-    return math.inf if {*keys} & {*LISTS} else len(keys)
 
 
 def _refuse(title: str, word: str, known: Sequence[str]) -> None:
@@ -109,7 +103,8 @@ def _page(verb: str, title: str, container: Mapping[str, Any]) -> list[str]:
     texts = texts_of(verb)
     lines.append("Settings (key=value; these are the values without it):")
     for key, value in _flat({k: v for k, v in container.items() if k not in groups}).items():
-        lines += _beside(f"{key}={'' if value == '???' else _plain(value)}", _required(value) + texts.get(key, ""))
+        shown, remark = ("", "(required) ") if value == "???" else (_plain(value), "")
+        lines += _beside(f"{key}={shown}", remark + texts.get(key, ""))
     return [*lines, "", *hydra_help["footer"].rstrip().splitlines()]
 
 
@@ -142,11 +137,8 @@ def _slots(group: str) -> list[str]:
 
     slots = MANY_TERMS.get(group, Ramp if group == "schedule" else None)
     texts, item = (attributes(slots) if slots else {}), "NAME" if slots is Ramp else "TERM"
-    return (
-        ["", *(line for name, text in texts.items() for line in _beside(f"{group}.{item}.{name}", text))]
-        if texts
-        else []
-    )
+    lines = [line for name, text in texts.items() for line in _beside(f"{group}.{item}.{name}", text)]
+    return ["", *lines] if lines else []
 
 
 def texts_of(verb: str) -> dict[str, str]:
@@ -216,17 +208,10 @@ def _plain(value: Any) -> str:
     return "{}" if value == {} else str(value)
 
 
-def _required(value: Any) -> str:
-    return "(required) " if value == "???" else ""
-
-
-def _width() -> int:
-    return max(60, min(120, shutil.get_terminal_size((120, 24)).columns))
-
-
 def _beside(key: str, text: str, width: int = KEY_WIDTH) -> list[str]:
     """Return a key and its text side by side, the text wrapped; a long key has a line of its own."""
-    wrapped = textwrap.wrap(text.replace("``", "").replace("None", "null").rstrip("."), _width() - width - 4) or [""]
+    available = max(60, min(120, shutil.get_terminal_size((120, 24)).columns)) - width - 4
+    wrapped = textwrap.wrap(text.replace("``", "").replace("None", "null").rstrip("."), available) or [""]
     indent = " " * (width + 4)
     if len(key) > width:
         return [f"  {key}", *(f"{indent}{line}" for line in wrapped if line)]

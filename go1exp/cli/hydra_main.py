@@ -188,7 +188,9 @@ def choices_from_files(arguments: Sequence[str], verb: str) -> list[str]:
             continue
 
         def name_of(item: re.Match[str], group: str = group) -> str:
-            file = _unquoted(item[0])
+            file = item[0].strip()
+            if file[:1] in ("'", '"'):
+                file = re.sub(r"\\(.)", r"\1", file[1:-1])
             if not re.search(r"\.ya?ml$", file):
                 return item[0]
             try:
@@ -201,12 +203,6 @@ def choices_from_files(arguments: Sequence[str], verb: str) -> list[str]:
     if problems:
         raise ConfigError(problems)
     return chosen
-
-
-def _unquoted(item: str) -> str:
-    """Return an item of a list without the spaces and the quotes round it."""
-    item = item.strip()
-    return re.sub(r"\\(.)", r"\1", item[1:-1]) if item[:1] in ("'", '"') else item
 
 
 def _choice(group: str, file: str, verb: str) -> str:

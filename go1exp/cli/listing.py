@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from typing import Any, Literal
 
 from go1exp.cli.app import App, parse
@@ -58,12 +57,10 @@ def _print_group(group: str, choices: list[tuple[str, str]], what: str) -> None:
             source = plugins.origin(entry)
             print(f"  {entry.name:{len(group) + 27}} {entry.doc}{f'  [{source}]' if source else ''}")
             if entry.parameters:
-                print(f"  {'':{len(group) + 27}}   {', '.join(_parameter(p) for p in entry.parameters.values())}")
+                parameters = entry.parameters.values()
+                texts = (p.name if p.default is p.empty else f"{p.name}={p.default!r}" for p in parameters)
+                print(f"  {'':{len(group) + 27}}   {', '.join(texts)}")
     print()
-
-
-def _parameter(p: inspect.Parameter) -> str:
-    return p.name if p.default is p.empty else f"{p.name}={p.default!r}"
 
 
 def _choices() -> dict[str, list[tuple[str, str]]]:

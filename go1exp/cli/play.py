@@ -12,7 +12,7 @@ from go1exp.cli import subjects
 from go1exp.cli.app import App, parse, spinner
 from go1exp.cli.evaluate import writable_file
 from go1exp.cli.play_web import PlaySettings, address, log, walk
-from go1exp.cli.subjects import Named, agent, driven, named
+from go1exp.cli.subjects import agent
 from go1exp.config.schema.registry import ConfigError
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ FORMATS = (".mp4", ".gif")
 
 def _task(container: dict[str, Any]) -> None:
 
-    judge, container = subjects.split_engine(container)
+    engine, container = subjects.split_engine(container)
     other, container = subjects.split_robot(container)
     ground = _ground(container.pop("terrain", None))
     settings = parse(PlaySettings, container)
@@ -38,17 +38,18 @@ def _task(container: dict[str, Any]) -> None:
         return
     if ground is not None and settings.train_ground:
         raise ConfigError(["train_ground = True and terrain: only one of them says what the ground is"])
-    subject = _subject(settings)
+    subject = subjects.subject_of(settings, subjects.chosen_controller(settings.controller), "play.mp4")
     out = Path(settings.out or subject.folder)
     if out.is_dir():
         raise ConfigError([f"out = {str(out)!r}: is a folder; name the file, such as out={out / 'play.mp4'}"])
     if out.suffix.lower() not in FORMATS:
         raise ConfigError([f"out = {str(out)!r}: a clip is {' or '.join(FORMATS)}"])
     if settings.viewer == "web":
-        walk(subject, other, ground, judge, settings, where)
+        walk(subject, other, ground, engine, settings, where)
         return
 
-    live = settings.viewer == "live" or (settings.viewer == "auto" and _has_display())
+    has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    live = settings.viewer == "live" or (settings.viewer == "auto" and has_display)
     if not live:
         writable_file(out)
 
@@ -57,7 +58,7 @@ def _task(container: dict[str, Any]) -> None:
 
     drives = agent(subject, other)
     whole = {"episodes": 1, "duration_s": settings.seconds, "settle_s": 0.0, "policy_dt": None}
-    shown = EvalConfig.from_settings(settings, commands=(settings.velocity,), engine=judge, **whole)
+    shown = EvalConfig.from_settings(settings, commands=(settings.velocity,), engine=engine, **whole)
     shown_task = evaluation_task(drives.task, shown)
     if ground is not None:
         shown_task = dataclasses.replace(shown_task, terrain=ground)
@@ -93,14 +94,6 @@ def _log(settings: PlaySettings, where: tuple[str, int]) -> None:
     log(Path(str(settings.log)), where)
 
 
-def _subject(settings: PlaySettings) -> Named:
-    """Return who walks; raise ConfigError if that is not there."""
-    controller = subjects.chosen_controller(settings.controller)
-    if controller is None:
-        return named(settings.run, settings.policy, settings.bundle, settings.checkpoint, "play.mp4")
-    return driven(controller, settings.run, settings.policy, settings.bundle, "play.mp4")
-
-
 def _show(core: Go1Core, policy: Policy, settings: PlaySettings, out: Path | None) -> None:
     """Write clip and picture, or open the live viewer if there is no file for them."""
     from go1exp.evaluate import video
@@ -113,7 +106,7 @@ def _show(core: Go1Core, policy: Policy, settings: PlaySettings, out: Path | Non
     if video.length(settings.seconds, settings.fps) < 1:
         raise ConfigError([f"seconds = {settings.seconds:g}: shorter than a picture at fps = {settings.fps}"])
     core.command.value[:] = core.command.value.new_tensor(settings.velocity)
-    progress = spinner(1, "filming")
+    progress = spinner(1, "recording a video")
     try:
         frames = video.record(core, policy, settings.seconds, fps=settings.fps, on_frame=progress, footfalls=True)
     except RenderingUnavailable as error:
@@ -121,23 +114,14 @@ def _show(core: Go1Core, policy: Policy, settings: PlaySettings, out: Path | Non
         print(f"{error}\nA stick figure instead: {out.with_suffix('.png')}")
         return
     gif = out.suffix.lower() == ".gif"
-    if gif:  # an .mp4 is written picture by picture
-        _refuse_too_long(settings, settings.fps * video.GIF_BYTES)
+    # an .mp4 is written picture by picture
+    if gif and (wrong := memory.too_long(settings.seconds, settings.fps * video.GIF_BYTES)):
+        raise ConfigError([f"seconds = {settings.seconds:g}: a GIF {wrong}; an .mp4 of any length does"])
     panels: list[Picture] = []
-    film = video.keeping(frames, video.length(settings.seconds, settings.fps), panels)
-    (video.write_gif if gif else video.write_mp4)(out, film, settings.fps)
+    kept = video.keeping(frames, video.length(settings.seconds, settings.fps), panels)
+    (video.write_gif if gif else video.write_mp4)(out, kept, settings.fps)
     video.write_strip(out.with_suffix(".png"), panels)
     print(f"written to {out} and {out.with_suffix('.png')}")
-
-
-def _refuse_too_long(settings: PlaySettings, rate: float) -> None:
-    """Raise ConfigError if a GIF that takes ``rate`` B/s does not fit into memory."""
-    if wrong := memory.too_long(settings.seconds, rate):
-        raise ConfigError([f"seconds = {settings.seconds:g}: a GIF {wrong}; an .mp4 of any length does"])
-
-
-def _has_display() -> bool:
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 APP = App("play", _task, PlaySettings)

@@ -117,17 +117,17 @@ def walk(
     subject: Named,
     other: dict[str, Any],
     ground: TerrainConfig | None,
-    judge: BackendConfig,
+    engine: BackendConfig,
     settings: PlaySettings,
     where: tuple[str, int],
 ) -> None:
     """Show a robot that walks, until Ctrl-C.
 
     Args:
-        subject: who drives first.
+        subject: what drives first.
         other: choices of another robot (``subjects.split_robot``).
         ground: to walk on; None takes that of the settings.
-        judge: what moves the robot.
+        engine: physics engine.
         settings: of the verb.
         where: to listen, host and port.
     """
@@ -153,7 +153,7 @@ def walk(
             physics_dt=settings.physics_dt,
             randomize=settings.randomize,
             push=settings.push,
-            engine=judge,
+            engine=engine,
             seed=settings.seed,
         )
         robots = Robots(_agents(subject, first, other), grounds, effects)
@@ -164,7 +164,7 @@ def walk(
 
 
 def _agents(subject: Named, first: Agent, other: dict[str, Any]) -> dict[str, Callable[[], Agent]]:
-    """Return who could drive this robot, loaded when they are asked for: shipped policies, newest runs, the MPC."""
+    """Return what could drive this robot, loaded on request: shipped policies, newest runs, the MPC."""
 
     def loader(name: str) -> Callable[[], Agent]:
         return lambda: agent(word(name, "play"), other, robot_of=first.task)
@@ -210,7 +210,7 @@ def sim(
         groups: the configuration that it is made of, as plain data.
         config: how it is set up.
         robot_at: where it listens for its client, host and port.
-        seconds: how long it lives, s; None until Ctrl-C.
+        seconds: how long it runs, s; None until Ctrl-C.
         where: to serve the page, host and port.
     """
     require_studio()
@@ -232,7 +232,7 @@ def sim(
 
 
 def printed(line: str) -> None:
-    """Print a line of the robot, which lives in another process."""
+    """Print a line of the robot, which runs in another process."""
     print(line, flush=True)
 
 

@@ -22,7 +22,6 @@ from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
 from go1exp.logs.record.plan import RecordingConfig
 
 if TYPE_CHECKING:
-    from go1exp.logs.record.plan import Episode
     from go1exp.logs.record.simulate import Rig
     from go1exp.logs.recording import Recording
     from go1exp.sim.env.core import Go1Core
@@ -120,7 +119,7 @@ def _motions(given: Any) -> list[Term]:
 
 
 def _unused(settings: RecordSettings) -> list[str]:
-    """Return complaints about settings of motions that a policy does not heed."""
+    """Return problems of settings of motions that a policy ignores."""
     wrong = []
     if len(settings.gains) > 1 or settings.repeats or len(settings.seeds) > 1:
         wrong.append("gains, seeds, repeats: are for motions; a policy's gains are actuator.kp and actuator.kd")
@@ -159,29 +158,23 @@ def _record(container: dict[str, Any]) -> None:
     episodes = plan.episodes(driven, settings)  # refuses wrong settings before the folder is made
     if names & {POLICY, MPC}:
         plan.refuse_too_long(settings, "episodes", settings.episodes)
-    from go1exp.logs.record.simulate import Rig
+    from go1exp.logs.record import simulate
 
-    rig = Rig(**{name: parts[name] for name in groups}, physics_dt=settings.physics_dt)
+    rig = simulate.Rig(**{name: parts[name] for name in groups}, physics_dt=settings.physics_dt)
     out = writable(settings.out)
     if present := sorted(p.name for p in out.glob("*.parquet")):
         held = counted(len(present), "recording")
         print(f"note: {out} holds {held} already; they stay, those of the same name are replaced")
-    recordings = _record_motions(rig, episodes, settings)
+    recordings: list[Recording] = []
+    if episodes:
+        show = spinner(1, f"recording {len(episodes)} episodes")
+        recordings += simulate.play(rig, episodes, settings.sensors, settings.seed, show)
     if walk and POLICY in names:
         recordings += _record_policy(rig, walk, settings)
     if MPC in names:
         recordings += _record_mpc(rig, parts["controller"], settings)
     _write(out, recordings)
-
-
-def _record_motions(rig: Rig, episodes: list[Episode], settings: RecordSettings) -> list[Recording]:
-    """Drive simulated robots through the motions; return a recording of each episode."""
-    from go1exp.logs.record import simulate
-
-    if not episodes:
-        return []
-    show = spinner(1, f"recording {len(episodes)} episodes")
-    return simulate.play(rig, episodes, settings.sensors, settings.seed, show)
+    print(f"now: {command('record', 'audit', str(out))}")
 
 
 def _record_policy(rig: Rig, run: Path, settings: RecordSettings) -> list[Recording]:
@@ -231,14 +224,13 @@ def _record_mpc(rig: Rig, controller: MpcSettings, settings: RecordSettings) -> 
 
 
 def _write(out: Path, recordings: list[Recording]) -> None:
-    """Write the recordings and print what to do with them."""
+    """Write the recordings and print their number and length."""
     from go1exp.logs import recording
 
     for r in recordings:
         recording.write(out / f"{r.meta.episode}.parquet", r)
     total = sum(float(r.t[-1] - r.t[0]) for r in recordings)
     print(f"{counted(len(recordings), 'recording')}, {total:.0f} s, in {out}")
-    print(f"now: {command('record', 'audit', str(out))}")
 
 
 APP = App("record", _record, RecordSettings)
@@ -282,7 +274,7 @@ def _audit(container: dict[str, Any]) -> int:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_json(out, reports)
         print(f"written to {out}")
-    if unreadable:  # the others have been judged all the same
+    if unreadable:  # the others have been audited
         raise RecordingError("\n".join(unreadable))
     return status
 
@@ -296,7 +288,6 @@ NAMED = 3
 
 def _import(container: dict[str, Any]) -> None:
     from go1exp.cli.hydra_main import mapping_of
-    from go1exp.logs import recording
     from go1exp.logs.importers import import_recordings
 
     settings = parse(ImportSettings, container)
@@ -306,13 +297,10 @@ def _import(container: dict[str, Any]) -> None:
     recordings = import_recordings(settings.source, Path(settings.path), options)
     _refuse_one_name(settings.path, [r.meta.episode for r in recordings])
     out = writable(settings.out)
-    files = [out / f"{r.meta.episode}.parquet" for r in recordings]
-    if present := [file.name for file in files if file.exists()]:
+    names = [f"{r.meta.episode}.parquet" for r in recordings]
+    if present := [name for name in names if (out / name).exists()]:
         print(f"note: {out} holds {_listed(present)} of an earlier call; new ones replace them (or: out=FOLDER)")
-    for file, r in zip(files, recordings, strict=True):
-        recording.write(file, r)
-    total = sum(float(r.t[-1] - r.t[0]) for r in recordings)
-    print(f"{counted(len(recordings), 'recording')}, {total:.0f} s, in {out}")
+    _write(out, recordings)
     for note in [*_wrong_steps(recordings), *dict.fromkeys(r.meta.notes for r in recordings if r.meta.notes)]:
         print(f"note: {note}")
 

@@ -46,6 +46,6 @@ def _task(container: dict[str, Any]) -> int:
 
 
 HERE = ("127.0.0.1", 8007)
-"""Where it listens unless told otherwise: nobody else in the network can reach it."""
+"""Default address; it cannot be reached from the network."""
 
 APP = App("sim", _task, SimSettings)

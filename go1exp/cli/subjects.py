@@ -107,28 +107,14 @@ def chosen_controller(given: Any) -> MpcSettings | None:
     return settings
 
 
-def controller_conditions(run: str | None, policy: str | None, file: str, out: str | None) -> tuple[TaskConfig, Path]:
-    """Return the task in which another controller walks, and the file for results; arguments as ``runs.trained``'s.
+def controlled(run: str | None, policy: str | None, file: str, out: str | None) -> tuple[Path, Path]:
+    """Return the folder of the run whose robot another controller moves, and the file for results.
 
-    The task is that of the run or the shipped policy that is named, else that of ``CONDITIONS``.
+    The run is the one or the shipped policy that is named, else ``CONDITIONS``; the file is ``out``, or ``mpc_FILE``
+    here. Arguments and errors are those of ``places.trained``.
     """
-    return task_of_run(controlled_robot(run, policy)), results_of_controller(run, policy, file, out)
-
-
-def controlled_robot(run: str | None, policy: str | None) -> Path:
-    """Return the folder of the run whose robot another controller moves.
-
-    Raises:
-        ConfigError: if there is no such run or policy.
-    """
-    named = run is not None or policy is not None
-    return trained(run, policy if named else CONDITIONS, "", None)[0]
-
-
-def results_of_controller(run: str | None, policy: str | None, file: str, out: str | None) -> Path:
-    """Return where results go: ``out``, or ``mpc_FILE`` here."""
-    named = run is not None or policy is not None
-    return trained(run, policy if named else CONDITIONS, file, out)[1] if out else Path(f"mpc_{file}")
+    folder, results = trained(run, CONDITIONS if run is None and policy is None else policy, file, out)
+    return folder, results if out else Path(f"mpc_{file}")
 
 
 def task_of_run(run: Path) -> TaskConfig:
@@ -174,8 +160,21 @@ def driven(controller: MpcSettings, run: str | None, policy: str | None, bundle:
     """
     if bundle is not None:
         raise ConfigError([f"bundle = {bundle!r}: is a policy; controller=mpc takes none"])
-    folder = results_of_controller(run, policy, file, None)
-    return Named("mpc", folder, run=controlled_robot(run, policy), controller=controller)
+    folder, results = controlled(run, policy, file, None)
+    return Named("mpc", results, run=folder, controller=controller)
+
+
+def subject_of(settings: Any, controller: MpcSettings | None, file: str) -> Named:
+    """Return the subject of a verb's keys run, policy, bundle and checkpoint; errors as ``named``'s and ``driven``'s.
+
+    Args:
+        settings: of the verb.
+        controller: that moves the robot in place of a policy, or None.
+        file: what the results are called.
+    """
+    if controller is None:
+        return named(settings.run, settings.policy, settings.bundle, settings.checkpoint, file)
+    return driven(controller, settings.run, settings.policy, settings.bundle, file)
 
 
 def named(run: str | None, policy: str | None, bundle: str | None, checkpoint: str | None, file: str) -> Named:
@@ -269,15 +268,15 @@ def agent(subject: Named, other: dict[str, Any], robot_of: TaskConfig | None = N
     """Load what drives the robots.
 
     Args:
-        subject: who.
+        subject: what drives.
         other: choices of another robot (``split_robot``).
-        robot_of: the task whose robot, drives, effects, contact and randomisation are taken; None takes its own.
+        robot_of: the task whose robot, actuators, effects, contact and randomisation are taken; None takes its own.
 
     Raises:
         ConfigError: if a run's configuration is not one that this version knows.
         go1exp.deploy.runtime.bundle.BundleError: if a bundle is damaged or was changed.
     """
-    from go1exp.evaluate.agents import BundleAgent, PolicyAgent
+    from go1exp.evaluate.agents import BundleAgent, ControllerAgent, PolicyAgent
 
     if subject.bundle is not None:
         from go1exp.deploy.runtime.bundle import load
@@ -289,20 +288,13 @@ def agent(subject: Named, other: dict[str, Any], robot_of: TaskConfig | None = N
         return BundleAgent(subject.label, task, bundle, about)
     assert subject.run is not None
     if subject.controller is not None:
-        return _controlled(subject, subject.controller, other, robot_of)
+        task, controller = _robot(task_of_run(subject.run), other, robot_of), subject.controller
+        settings = {"controller": dataclasses.asdict(controller), "robot_of_run": str(subject.run)}
+        return ControllerAgent(subject.label, task, controller_maker(controller, task), settings)
     from go1exp.train.policy import load_run
 
     of_run, policy, about = load_run(subject.run, subject.checkpoint)
     return PolicyAgent(subject.label, _robot(of_run.task, other, robot_of), policy, about)
-
-
-def _controlled(subject: Named, controller: MpcSettings, other: dict[str, Any], robot_of: TaskConfig | None) -> Agent:
-    from go1exp.evaluate.agents import ControllerAgent
-
-    assert subject.run is not None
-    task = _robot(task_of_run(subject.run), other, robot_of)
-    about = {"controller": dataclasses.asdict(controller), "robot_of_run": str(subject.run)}
-    return ControllerAgent(subject.label, task, controller_maker(controller, task), about)
 
 
 SAME = ("robot", "actuator", "effect", "contact", "rand", "termination")

@@ -1,4 +1,4 @@
-"""Sweeps: every job is checked before the first one starts, run by a launcher, and told of after the last one.
+"""Sweeps: every job is checked before the first one starts, run by a launcher, and reported after the last one.
 
 Hydra composes ``-m`` and its sweeper says which jobs there are; then it is left. A job is a run folder that holds its
 configuration, and running it is going on with that run, so a change of ``conf/`` never reaches a job that waits.
@@ -36,7 +36,7 @@ LOG = "job.log"
 
 @dataclass(frozen=True)
 class Rules:
-    """What a verb knows of its jobs.
+    """Functions of a verb for its jobs.
 
     Attributes:
         resolve: ``(container, overrides, run folder) -> job``; raises ConfigError; touches no file.
@@ -156,7 +156,7 @@ def _checked(
     checked: list[dict[str, Any]] = []
     for number, job in enumerate([] if runs.remote else jobs):
         about = {key: value for key, value in job.container.items() if key != "seed"}
-        if about not in checked:  # a seed changes nothing that this machine could lack
+        if about not in checked:  # a seed changes no requirement on this machine
             checked.append(about)
             with _noting(app, problems, number):
                 rules.check(job)
@@ -191,7 +191,7 @@ def _refuse_another(old: Index, new: Index, folder: Path) -> None:
 
 
 class _Watch:
-    """Keeps ``sweep.json`` as its jobs change, and says so."""
+    """Updates ``sweep.json`` as its jobs change, and prints the changes."""
 
     def __init__(self, folder: Path, known: Index) -> None:
         self.folder, self.index = folder, known
@@ -199,14 +199,14 @@ class _Watch:
         self._warned = False
 
     def ended(self, task: Task, how: Ended) -> None:
-        """Take down what a job said last, if it went wrong."""
+        """Keep the last message of a job that failed."""
         cause = re.sub(r"^go1exp train: ", "", how.cause)
         if cause and how.status != STOPPED:
             self.causes[task.run_folder] = cause
         self.changed()
 
     def changed(self) -> None:
-        """Look at the run folders; write and tell what is new."""
+        """Look at the run folders; write and print what is new."""
         from go1exp.train.sweep import index
 
         now = index.looked_at(self.index, self.folder, self.causes)
@@ -232,7 +232,7 @@ class _Watch:
 
 
 def _launch(rules: Rules, app: App, folder: Path, known: Index, runs: Launcher, overrides: list[str]) -> int:
-    """Run what is not done in a folder that is locked; tell of the sweep; return the exit status."""
+    """Run what is not done in a folder that is locked; report on the sweep; return the exit status."""
     from go1exp.train.sweep import index
     from go1exp.train.sweep.command import Task
 

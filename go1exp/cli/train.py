@@ -193,7 +193,7 @@ def _run(job: TrainJob) -> int | None:
     with run_state.locked(job.run):
         try:
             if not job.resumed:
-                _refuse_other(job.run, job.container)  # again: now nobody else can begin one there
+                _refuse_other(job.run, job.container)  # again: now no other process can begin one there
             first = _first_weights(job)
             if _is_finished(job):
                 return None
@@ -213,7 +213,7 @@ def _first_weights(job: TrainJob) -> Weights | None:
 
 
 def _is_finished(job: TrainJob) -> bool:
-    """Whether the folder holds all iterations already, or was ended by the same rule; says so."""
+    """Whether the folder holds all iterations already, or was ended by the same rule; print it."""
     from go1exp.train import checkpoint, early_stop, run_state
 
     wanted = job.config.ppo.iterations

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from functools import partial
 
 from go1exp.base.errors import Expected
 from go1exp.base.signals import STOPPED, handled, interrupt, say
@@ -25,6 +26,17 @@ def not_negative(text: str) -> float:
     return 0.0 if float(text) == 0.0 else positive(text)
 
 
+TIMES = (
+    ("stand_up", not_negative, "s from the first pose to the nominal stance"),
+    ("lie_down", not_negative, "s for lying down at the end of a walk; 0: brake at once"),
+    ("brake", not_negative, "s for which the motors brake at the end"),
+    ("keep", positive, "newest seconds that the log holds"),
+    ("stale", positive, "s without a state after which the robot is lost"),
+    ("spin", not_negative, "s before each cycle for which the core is kept busy"),
+)
+"""Settings of the plan in seconds: name, type and meaning."""
+
+
 def arguments(given: Sequence[str]) -> argparse.Namespace:
     """Read the command line."""
     from go1exp.deploy.runtime.walk import Plan
@@ -42,25 +54,8 @@ def arguments(given: Sequence[str]) -> argparse.Namespace:
     )
     parser.add_argument("--amplitude", default="1,0.3,0.8", help="of the sinusoid")
     parser.add_argument("--period", type=positive, default=10.0, help="of the sinusoid, s")
-    parser.add_argument(
-        "--stand-up", type=not_negative, default=Plan.stand_up, help="s from the first pose to the nominal stance"
-    )
-    parser.add_argument(
-        "--lie-down",
-        type=not_negative,
-        default=Plan.lie_down,
-        help="s for lying down at the end of a walk; 0: brake at once",
-    )
-    parser.add_argument(
-        "--brake", type=not_negative, default=Plan.brake, help="s for which the motors brake at the end"
-    )
-    parser.add_argument("--keep", type=positive, default=Plan.keep, help="newest seconds that the log holds")
-    parser.add_argument(
-        "--stale", type=positive, default=Plan.stale, help="s without a state after which the robot is lost"
-    )
-    parser.add_argument(
-        "--spin", type=not_negative, default=Plan.spin, help="s before each cycle for which the core is kept busy"
-    )
+    for name, kind, meaning in TIMES:
+        parser.add_argument(f"--{name.replace('_', '-')}", type=kind, default=getattr(Plan, name), help=meaning)
     parser.add_argument("--out", default="runs/deploy", help="folder of the logs")
     sim = parser.add_argument_group("with --robot sim")
     sim.add_argument("--start", choices=("standing", "lying", "suspended"), default="standing")
@@ -92,24 +87,15 @@ def _walk(options: argparse.Namespace) -> int:
     try:
         amplitude = tuple(float(part) for part in options.amplitude.split(","))
         command = CommandConfig(parsed(options.command), amplitude, options.period)
-        plan = Plan(
-            rate=options.rate,
-            seconds=options.seconds,
-            command=command,
-            stand_up=options.stand_up,
-            lie_down=options.lie_down,
-            brake=options.brake,
-            keep=options.keep,
-            stale=options.stale,
-            spin=options.spin,
-        )
+        times = {name: getattr(options, name) for name, _, _ in TIMES}
+        plan = Plan(rate=options.rate, seconds=options.seconds, command=command, **times)
         sim = {name: getattr(options, name) for name in ("start", "noise", "delay", "jitter", "loss", "seed")}
         sim |= {"feet": options.foot_sensors}
         if options.check:
             return _check(options)
         where = options.bundle, options.robot, plan, options.out, sim
         job = Job(*where, truth=options.truth, address=options.address, feet=options.feet)
-        return run_job(job, lambda line: print(line, flush=True))
+        return run_job(job, partial(print, flush=True))
     except (Expected, OSError, ValueError) as error:
         print(f"go1exp.deploy: {error}", file=sys.stderr)
         return FAILED
@@ -121,14 +107,13 @@ def _check(options: argparse.Namespace) -> int:
     import numpy as np
 
     from go1exp.deploy.runtime.bundle import load
-    from go1exp.deploy.runtime.job import CheckJob, run_check
+    from go1exp.deploy.runtime.job import run_check
 
     if options.robot != "go1":
         raise ValueError(f"--check with --robot {options.robot}: is for --robot go1")
     about = load(options.bundle).metadata
     feet = Path(options.feet or Path(options.out) / "feet.json")
-    job = CheckJob(about.joints, np.array(about.joint_limits), feet, options.address)
-    return run_check(job, lambda line: print(line, flush=True))
+    return run_check(about.joints, np.array(about.joint_limits), feet, options.address, partial(print, flush=True))
 
 
 if __name__ == "__main__":

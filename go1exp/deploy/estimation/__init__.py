@@ -58,14 +58,8 @@ def compiled() -> ModuleType:
         return importlib.import_module("go1exp.deploy.estimation._kalman")
     except ImportError as error:
         folder = Path(__file__).parent
-        extensions = [
-            file.name for file in sorted(folder.glob("_kalman.*")) if file.suffix in (".so", ".pyd", ".dylib")
-        ]
-        why = (
-            f"{', '.join(extensions)} does not load: {error}"
-            if extensions
-            else f"no _kalman extension in {folder.name}/"
-        )
+        built = [f.name for f in sorted(folder.glob("_kalman.*")) if f.suffix in (".so", ".pyd", ".dylib")]
+        why = f"{', '.join(built)} does not load: {error}" if built else f"no _kalman extension in {folder.name}/"
         raise EstimatorError(
             f"the Kalman filter is not built for this Python ({why}). Install a C++17 compiler (Debian: g++ and "
             "python3-dev), then `make setup`, or `pip install -e .` in the checkout; its build brings pybind11 and "

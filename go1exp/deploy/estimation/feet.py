@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from go1exp import robot
 from go1exp.base.errors import Expected
 from go1exp.deploy.estimation import FilterConfig, compiled_legs
 
-LEGS = 4
+LEGS = robot.NUM_LEGS
 SINGULAR = 1e-6
 """Smallest determinant of a leg's Jacobian, m3/rad3: a straighter leg's torques do not give the force along it."""
 
@@ -163,10 +164,6 @@ def calibrated(
         return None, "unchanged: zeros are unknown; run check=true first while the robot lies or is suspended"
     scale = (counts - before.zero) / by_torque
     if scale.min() <= 0.0:
-        return before, f"unchanged: the counts of {legs_below(scale)} do not grow under load"
+        legs = ", ".join(leg for leg, value in zip(robot.LEGS, scale, strict=True) if value <= 0.0)
+        return before, f"unchanged: the counts of {legs} do not grow under load"
     return FootCalibration(before.zero, tuple(map(float, scale))), "scales, from a standing robot"  # type: ignore[arg-type]
-
-
-def legs_below(values: np.ndarray) -> str:
-    """Return the names of the legs whose values (4,) are not positive."""
-    return ", ".join(name for name, value in zip(("FR", "FL", "RR", "RL"), values, strict=True) if value <= 0.0)

@@ -56,7 +56,7 @@ class Estimate:
 
 
 def samples(recording: Recording, log: Log | None = None) -> np.ndarray:
-    """Return the log as input of the filter, ``(T, 51)``; quantities that it lacks are NaN.
+    """Return the log as input of the filter, ``(T, 51)``; missing quantities are NaN.
 
     Raises:
         RecordingError: if the robot does not have twelve joints, or the IMU or the joint angles are missing.

@@ -61,13 +61,6 @@ def readings(core: Go1Core) -> dict[str, Tensor]:
     return {name: values.float().clone() for name, values in current.items()}
 
 
-def traced_task(task: TaskConfig, seconds: float) -> TaskConfig:
-    """Return the task in which a trace is recorded: that of training, as one episode, on the CPU with one thread."""
-    period = task.sim.policy_dt
-    sim = dataclasses.replace(task.sim, episode_s=(round(seconds / period) + 2) * period, spread_starts=False)
-    return dataclasses.replace(task, sim=sim, backend=CpuBackend("cpu", threads=1), curriculum=())
-
-
 def record(
     task: TaskConfig,
     policy: Callable[[Tensor], Tensor],
@@ -89,9 +82,12 @@ def record(
         seed: seed of everything random.
         on_step: called with the progress in steps.
     """
-    core = Go1Core(traced_task(task, seconds), 1, seed, noise=False)
-    observation = core.reset()
     steps, period = max(1, round(seconds / task.sim.policy_dt)), task.sim.policy_dt
+    # that of training, as one episode, on the CPU with one thread
+    sim = dataclasses.replace(task.sim, episode_s=(round(seconds / period) + 2) * period, spread_starts=False)
+    traced = dataclasses.replace(task, sim=sim, backend=CpuBackend("cpu", threads=1), curriculum=())
+    core = Go1Core(traced, 1, seed, noise=False)
+    observation = core.reset()
     rows: list[dict[str, np.ndarray]] = []
     earlier = history_columns(task.observation).earlier
     for step in range(steps):

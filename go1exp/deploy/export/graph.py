@@ -12,7 +12,6 @@ import io
 import logging
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
@@ -38,23 +37,6 @@ class ExportError(Expected):
     """A part of a run that cannot be exported; the message names it."""
 
 
-def _same(reading: Tensor) -> Tensor:
-    return reading
-
-
-def _of_all(reading: Tensor) -> Tensor:
-    """(N, 1) -> (N,): a field with one number for each robot."""
-    return reading.squeeze(-1)
-
-
-@dataclass(frozen=True)
-class Source:
-    """Source of a field of the Snapshot on the robot: the name of a reading, and the function of it."""
-
-    reading: str
-    law: Callable[[Tensor], Tensor] = _same
-
-
 READINGS = (
     Port("joint_pos", J, "rad", "joint", "joint angles of the encoders"),
     Port("joint_vel", J, "rad/s", "joint", "joint velocities of the motors"),
@@ -75,19 +57,20 @@ PAST = Port(
 """Input of a graph whose observation has a history, behind the others; before there is a past, the first frame."""
 
 SOURCES = {
-    "base_lin_vel_b": Source("base_lin_vel_b"),
-    "base_ang_vel_b": Source("imu_gyro"),
-    "base_quat_w": Source("imu_quat"),
-    "projected_gravity_b": Source("imu_quat", projected_gravity),
-    "joint_pos": Source("joint_pos"),
-    "joint_vel": Source("joint_vel"),
-    "joint_torque": Source("joint_torque"),
-    "joint_target": Source("joint_target"),
-    "command": Source("command"),
-    "action": Source("previous_action"),
-    "episode_time": Source("walked", _of_all),
+    **{name: name for name in ("base_lin_vel_b", "joint_pos", "joint_vel", "joint_torque", "joint_target", "command")},
+    "base_ang_vel_b": "imu_gyro",
+    "base_quat_w": "imu_quat",
+    "projected_gravity_b": "imu_quat",
+    "action": "previous_action",
+    "episode_time": "walked",
 }
-"""Field of the Snapshot -> its source. The robot does not measure the other fields."""
+"""Field of the Snapshot -> the reading that it is computed from. The robot does not measure the other fields."""
+
+LAWS: dict[str, Callable[[Tensor], Tensor]] = {
+    "projected_gravity_b": projected_gravity,
+    "episode_time": lambda reading: reading.squeeze(-1),
+}
+"""Field -> its function of the reading, where it is not the reading itself."""
 
 OUTPUTS = (
     Port("joint_target", J, "rad", "joint", "position targets for the motors"),
@@ -122,8 +105,8 @@ class Sensed:
                 f"observation.{self._term}: reads {name}, which the robot does not measure; a policy for the robot may "
                 f"read {', '.join(SOURCES)}"
             )
-        self.read.add(source.reading)
-        return source.law(self._readings[source.reading])
+        self.read.add(source)
+        return LAWS[name](self._readings[source]) if name in LAWS else self._readings[source]
 
 
 def blocks(terms: Sequence[Term]) -> tuple[Block, ...]:

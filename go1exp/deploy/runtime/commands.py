@@ -11,6 +11,7 @@ import csv
 import importlib
 import math
 import os
+import re
 import select
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -187,12 +188,7 @@ class Keyboard(Constant):
 
 def split_keys(text: str) -> list[str]:
     """Split the characters of a terminal into keys: an arrow is three characters, Esc alone is one."""
-    keys, place = [], 0
-    while place < len(text):
-        size = 3 if text[place] == "\x1b" and text[place + 1 : place + 2] in ("[", "O") else 1
-        keys.append(text[place : place + size])
-        place += size
-    return keys
+    return re.findall(r"\x1b[\[O].?|.", text, re.DOTALL)
 
 
 DEAD = 0.1

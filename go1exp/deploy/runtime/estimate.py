@@ -129,6 +129,9 @@ class KalmanEstimator:
         return velocity if np.isfinite(velocity).all() else self._velocity
 
     def _sample(self, state: LowState, clock: float) -> np.ndarray:
+        forces = state.foot_force
+        if self._both is not None:
+            forces = self._both.loads(forces, state.joint_pos, state.joint_torque, state.imu_quat)
         return sample(
             clock,
             state.imu_quat,
@@ -137,7 +140,7 @@ class KalmanEstimator:
             state.joint_pos,
             state.joint_vel,
             state.joint_torque,
-            self._loads(state),
+            forces,
         )
 
     def _take(self, state: LowState, row: np.ndarray) -> None:
@@ -158,12 +161,6 @@ class KalmanEstimator:
         if not speed <= FASTEST:  # NaN too
             self._fail("estimator", f"the filter has diverged: {speed:g} m/s", state.t)
         self._velocity, self._row = velocity, row
-
-    def _loads(self, state: LowState) -> np.ndarray:
-        """Return the forces under the feet (4,), N, for the filter."""
-        if self._both is None:
-            return state.foot_force
-        return self._both.loads(state.foot_force, state.joint_pos, state.joint_torque, state.imu_quat)
 
 
 def acceleration(row: np.ndarray, velocity: np.ndarray) -> np.ndarray:

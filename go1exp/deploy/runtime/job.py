@@ -108,40 +108,32 @@ def _checked(link: Go1Link, bundle: Bundle, say: Say) -> Findings:
     return findings
 
 
-@dataclass(frozen=True)
-class CheckJob:
-    """A check of a robot.
+def run_check(joints: Sequence[str], stops: np.ndarray, feet: Path, address: str | None, say: Say) -> int:
+    """Check a robot, calibrate its foot sensors, and return the exit status: 0 if a walk may begin.
 
-    Attributes:
+    Args:
         joints: names.
         stops: (J, 2) hard stops, rad.
         feet: file of the foot sensors' calibration, to be made or completed.
         address: HOST:PORT; that of every Go1 if None.
-    """
-
-    joints: Sequence[str]
-    stops: np.ndarray
-    feet: Path
-    address: str | None = None
-
-
-def run_check(job: CheckJob, say: Say) -> int:
-    """Check a robot, calibrate its foot sensors, and return the exit status: 0 if a walk may begin.
+        say: prints a line.
 
     Raises:
         go1exp.base.errors.Expected: if the address or the calibration's file is wrong.
         OSError: if the socket or the file cannot be opened.
     """
-    host, port = parsed_address(job.address)
+    host, port = parsed_address(address)
     say(f"listening to {host}:{port}; no torque is commanded")
     with closing(Go1Link(host, port)) as link:
-        findings = check(link, job.joints, job.stops, estimator_settings({}), say)
+        findings = check(link, joints, stops, estimator_settings({}), say)
     if not findings.problems:
-        calibrate(findings, job.feet, say)
+        calibrate(findings, feet, say)
+        say("check passed: a walk may begin")
+        return 0
     for problem in findings.problems:
         say(f"problem: {problem}")
-    say("check passed: a walk may begin" if not findings.problems else "check failed: no walk would begin")
-    return NOT_PASSED if findings.problems else 0
+    say("check failed: no walk would begin")
+    return NOT_PASSED
 
 
 NOT_PASSED = 1

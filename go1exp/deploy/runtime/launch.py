@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import select
@@ -11,7 +12,6 @@ import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -43,7 +43,7 @@ SPARE, SPARE_S = 1.5, 30.0
 """Factor and additional time by which the robot keeps more than the log, which has gaps and ends earlier."""
 
 
-class SimulatedRobot:
+class SimulatedRobot(contextlib.AbstractContextManager["SimulatedRobot"]):
     """A simulated Go1 in a process of its own that listens at a port of this machine.
 
     Attributes:
@@ -142,12 +142,6 @@ class SimulatedRobot:
                 self.truth = dict(zip(columns, rows.T, strict=True))
         self._folder.cleanup()
 
-    def __enter__(self) -> SimulatedRobot:
-        """Return itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Close."""
         self.close()

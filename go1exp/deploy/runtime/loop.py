@@ -199,7 +199,7 @@ def run(
     """
     clock = clock or MonotonicClock()
     period = 1.0 / rate
-    account = Deadlines(period)
+    deadlines = Deadlines(period)
     total = None if seconds is None else max(1, round(seconds * rate))
     collecting = gc.isenabled()
     gc.collect()
@@ -217,14 +217,14 @@ def run(
             following = max(cycle + 1, math.floor((end - begin) / period + 1e-9))
             if total is not None:
                 following = min(following, total)
-            account.note(due, start, end, following - cycle - 1)
+            deadlines.note(due, start, end, following - cycle - 1)
             cycle = following
             if not wanted:
                 break
             if on_report is not None and end >= next_report:
-                on_report(account.timing())
+                on_report(deadlines.timing())
                 next_report = end + report_every
     finally:
         if collecting:
             gc.enable()
-    return account.timing()
+    return deadlines.timing()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -130,7 +131,7 @@ class Safety:
         """
         if self.fault is None:
             for name, rule in RULES.items():
-                if message := rule(self, state, command, now):
+                if (state is not None or name in STATELESS) and (message := rule(self, state, command, now)):
                     self.fault = Fault(name, now, message)
                     break
         if self.fault is not None or command is None or state is None:
@@ -191,10 +192,8 @@ class Safety:
         """A person, or a signal, requested the end."""
         return None if self._stop is None else f"requested by {self._stop}"
 
-    def stale_state(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
-        """The newest state is too old; before the first state this is no fault."""
-        if state is None:
-            return None  # the motors brake until a first state arrives
+    def stale_state(self, state: LowState, command: LowCmd | None, now: float) -> str | None:
+        """The newest state is too old."""
         age = now - state.t
         return f"the newest state is {1e3 * age:.0f} ms old" if age > self.config.stale else None
 
@@ -211,54 +210,44 @@ class Safety:
         where = self._joints[k] if len(values) == len(self._joints) else str(k)
         return f"{name} of {where} is {values[k]}"
 
-    def attitude(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
+    def attitude(self, state: LowState, command: LowCmd | None, now: float) -> str | None:
         """The attitude is not a unit quaternion, as from an IMU that has not started."""
-        if state is None:
-            return None
         length = math.sqrt(float(state.imu_quat @ state.imu_quat))
         off = abs(length - 1.0) > self.config.quat_error
         return f"the attitude quaternion's length is {length:.3f} instead of 1" if off else None
 
-    def tilt(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
+    def tilt(self, state: LowState, command: LowCmd | None, now: float) -> str | None:
         """The tilt of the trunk is too large: the robot falls."""
-        if state is None:
-            return None
         angle, limit = tilt_angle(state.imu_quat), self.config.tilt
         if angle <= limit:
             return None
         return f"tilt {math.degrees(angle):.0f} deg, the limit is {math.degrees(limit):.0f} deg"
 
-    def joint_range(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
+    def joint_range(self, state: LowState, command: LowCmd | None, now: float) -> str | None:
         """A joint is measured beyond its stop."""
-        if state is None:
-            return None
         beyond = np.maximum(self._stops[:, 0] - state.joint_pos, state.joint_pos - self._stops[:, 1])
         k = int(beyond.argmax())
         if beyond[k] <= self.config.beyond_stop:
             return None
         return f"{self._joints[k]} is at {state.joint_pos[k]:.3f} rad, {beyond[k]:.3f} rad beyond its stop"
 
-    def torque(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
+    def torque(self, state: LowState, command: LowCmd | None, now: float) -> str | None:
         """A motor reports more than its peak torque, for some cycles."""
-        if state is None:
-            return None
         share = np.abs(state.joint_torque) / self._torque_limit
         k = int(share.argmax())
         if not self._torque.exceeded(bool(share[k] > self.config.torque_margin)):
             return None
         return f"{self._joints[k]} reports {state.joint_torque[k]:.1f} N m, its limit is {self._torque_limit[k]:g} N m"
 
-    def power(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
+    def power(self, state: LowState, command: LowCmd | None, now: float) -> str | None:
         """The sum of |torque x velocity| is too large, for some cycles; driving and braking count alike."""
-        if state is None:
-            return None
         power = float(np.abs(state.joint_torque * state.joint_vel).sum())
         if not self._power.exceeded(power > self.config.power):
             return None
         return f"the motors' power is {power:.0f} W, the limit is {self.config.power:g} W"
 
 
-Rule = Callable[[Safety, LowState | None, LowCmd | None, float], str | None]
+Rule = Callable[[Safety, Any, LowCmd | None, float], str | None]
 
 RULES: dict[str, Rule] = {
     "operator_stop": Safety.operator_stop,
@@ -271,6 +260,9 @@ RULES: dict[str, Rule] = {
     "power": Safety.power,
 }
 """Name of a fault -> its rule, in the order of evaluation; the first rule with a message is the fault."""
+
+STATELESS = ("operator_stop", "not_finite")
+"""Rules that apply before the first state too; until it arrives the motors brake."""
 
 
 def tilt_angle(quat: np.ndarray) -> float:

@@ -61,7 +61,7 @@ class Traffic:
         foreign: rejected datagrams.
         refused_because: rejected datagrams by reason.
         overtaken: states of ``received`` that arrived after a newer one.
-        late: duplicates, and states that arrived too late to be used; they are dropped.
+        late: duplicates, and states that arrived too late for use; they are dropped.
         lost: states missing in the robot's count; dropped late ones count too.
         refused: times that the port at the other end was closed.
     """
