@@ -282,7 +282,7 @@ def test_a_robot_holds_its_pose_until_a_command_and_brakes_when_nobody_speaks(bu
         for _ in range(200):
             client.sendto(wire.IDLE, to)
             made.tick()
-        assert made.robot.sense_truth()[2] > 0.25  # it stands, as by its maker's own controller
+        assert made.robot.truth[2] > 0.25  # it stands, as by its maker's own controller
         client.sendto(stance_command(), to)
         made.tick()
         for tick in range(round(SILENCE / TICK) + 3):

@@ -8,13 +8,13 @@ import socket
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from go1exp import robot
 from go1exp.base.errors import Expected
-from go1exp.cli.play_web import printed
 from go1exp.config.compose import compose
 from go1exp.deploy.runtime import go1_wire
 from go1exp.deploy.sim_robot.machine import TICK, Body, Robot
@@ -32,6 +32,7 @@ GROUPS = ("robot", "actuator", "effect", "contact", "terrain")
 CONTAINER = compose("sim", ["effect=payload"])
 PARTS = parse_parts(CONTAINER, GROUPS)[0]
 STAND = go1_wire.pack_command(LowCmd(robot.NOMINAL_STANCE.copy(), np.full(12, 60.0), np.full(12, 1.0)))
+SAY = partial(print, flush=True)
 
 
 class Here:
@@ -81,7 +82,7 @@ def test_the_page_shows_where_the_robot_is_and_its_curves(here: Here) -> None:
     np.testing.assert_allclose(here.show.data.qpos, here.server.robot.pose())
     assert len(view.t) == len(view.height) == 40
     assert view.t[-1] == 0.0
-    assert view.height[-1] == pytest.approx(here.server.robot.sense_truth()[2], abs=1e-4)
+    assert view.height[-1] == pytest.approx(here.server.robot.truth[2], abs=1e-4)
     assert view.height[-1] > 0.25
     largest = np.array(view.torque).max(axis=1)
     assert ((largest > 0.0) & (largest < 1.0)).all()
@@ -151,7 +152,7 @@ def test_a_robot_takes_over_pose_speed_and_command_of_another(here: Here) -> Non
     np.testing.assert_array_equal(new.backend.qpos, old.backend.qpos)
     np.testing.assert_array_equal(new.backend.qvel, old.backend.qvel)
     np.testing.assert_array_equal(new.applied(), old.applied())
-    np.testing.assert_array_equal(new.sense_truth(), old.sense_truth())
+    np.testing.assert_array_equal(new.truth, old.sense_truth())
     assert (new.clock, new.commanded, new.braking) == (old.clock, True, False)
     new.step()
     assert new.clock == pytest.approx(old.clock + TICK)
@@ -267,9 +268,9 @@ def test_of_each_group_the_longest_interval_is_drawn() -> None:
 @pytest.mark.slow("go1exp/evaluate/viewer/", "go1exp/deploy/sim_robot/", "go1exp/cli/simulate.py")
 def test_the_robot_lives_in_a_process_of_its_own_and_ends_with_the_page(capfd: pytest.CaptureFixture[str]) -> None:
     groups = {name: CONTAINER[name] for name in GROUPS}
-    process = RobotProcess(groups, (0, 0), SimConfig(), ("127.0.0.1", 0), None, printed)
+    process = RobotProcess(groups, (0, 0), SimConfig(), ("127.0.0.1", 0), None, SAY)
     with pytest.raises(Expected, match=r"address = 127\.0\.0\.1:\d+: "):
-        RobotProcess(groups, (0, 0), SimConfig(), process.address, None, printed)
+        RobotProcess(groups, (0, 0), SimConfig(), process.address, None, SAY)
     show = SimShow(process, Body(**PARTS))
     ends = time.perf_counter() + 20.0
     view = None

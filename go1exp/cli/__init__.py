@@ -63,9 +63,7 @@ def main() -> int:
         # A library that is interrupted while it is loaded may raise something else.
         if not heard and not isinstance(error, KeyboardInterrupt):
             raise
-        signal.signal(
-            signal.SIGINT, signal.SIG_DFL
-        )  # what is left is to leave: a second Ctrl-C shall not be a traceback
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # a second Ctrl-C shall not be a traceback
         signals.say(f"{' '.join(['go1exp', *arguments[:1]])}: stopped")
         return signals.STOPPED
 

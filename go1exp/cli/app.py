@@ -88,7 +88,8 @@ class App:
             print(f"{title}: {message}", file=sys.stderr)
             return code
         finally:
-            stop_bars()
+            while _bars:  # one that an error leaves behind hides the terminal's cursor
+                _bars.pop().stop()
             warnings.formatwarning = formatwarning
         return next((s for s in status if s), 0) or 0
 
@@ -208,12 +209,6 @@ def discard(run: Path, of_lock: Sequence[str] = ()) -> None:
 
 
 _bars: list[Any] = []
-
-
-def stop_bars() -> None:
-    """End the bars that are still shown: one that an error leaves behind hides the terminal's cursor."""
-    while _bars:
-        _bars.pop().stop()
 
 
 def spinner(total: int, what: str) -> Callable[[int, int], None]:

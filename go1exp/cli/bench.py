@@ -74,7 +74,6 @@ GOALS = {
 
 
 def _task(container: dict[str, Any]) -> None:
-
     settings = parse(BenchSettings, container)
 
     from go1exp.sim.task import parse_train

@@ -134,7 +134,7 @@ def chosen_protocols(container: dict[str, Any], plain: dict[str, Any]) -> tuple[
 
 def _example(key: str, protocols: Sequence[Chosen]) -> str:
     first = protocols[0]
-    equivalent = {"episodes": "robots", "grid": "claims", "out": ""}.get(key, key)
+    equivalent = {"episodes": "robots", "grid": "claims"}.get(key, key)
     if key == "out":
         return "their folder is folder="
     return (
@@ -267,7 +267,6 @@ def _protocols(settings: Any, protocols: list[Any], conditions: _Conditions) -> 
 
 
 def _task(container: dict[str, Any]) -> None:
-
     engine, container = subjects.split_engine(container)
     other, container = subjects.split_robot(container)
     choice = {"protocol": container.pop("protocol")}

@@ -51,7 +51,6 @@ class ExportCheckSettings:
 
 
 def _export(container: dict[str, Any]) -> None:
-
     settings = parse(ExportSettings, container)
     run, out = trained(settings.run, settings.policy, "bundle.zip", settings.out)
     checkpoint = checkpoint_file(run, settings.checkpoint)
@@ -85,7 +84,6 @@ WIDTH = 120
 
 
 def _check(container: dict[str, Any]) -> None:
-
     settings = parse(ExportCheckSettings, container)
 
     from rich.console import Console

@@ -39,9 +39,6 @@ class FitActuatorSettings(FitSettings):
     out: str
 
 
-GO1 = "go1"
-
-
 def _inverse_dynamics(config: RobotConfig, smoothing: float | None) -> Callable[[Recording], np.ndarray]:
     """Return the function from a recording of a suspended Go1 to the torques (T, 12) at its joints, N m."""
     from go1exp.gap.actuator_net.dataset import WINDOW, smooth_motion
@@ -50,7 +47,7 @@ def _inverse_dynamics(config: RobotConfig, smoothing: float | None) -> Callable[
 
     def joint_torque(recording: Recording) -> np.ndarray:
         base = recording.meta.base_quat
-        if recording.meta.robot != GO1 or base is None:
+        if recording.meta.robot != "go1" or base is None:
             raise FitError(f"{recording.meta.episode}: target=joint_torque needs a Go1 whose trunk is held")
         motion = smooth_motion(recording, smoothing or WINDOW)
         return joint_torques(config, base, motion.q, motion.qd, motion.qdd)
@@ -76,7 +73,6 @@ def _with_gains(recordings: list[Recording], gains: tuple[float, float] | None) 
 
 
 def _task(container: dict[str, Any]) -> None:
-
     settings, parts = parse_with_groups(FitActuatorSettings, container, ("robot",))
 
     from go1exp.gap.actuator_net import fitting, plots, report

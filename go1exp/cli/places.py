@@ -80,11 +80,7 @@ FEWEST_ROWS = 4
 
 
 def files_of(places: str | Sequence[str]) -> list[Path]:
-    """Return the recordings' files of a folder or file, or of several.
-
-    Raises:
-        go1exp.logs.recording.RecordingError: if a folder has none.
-    """
+    """Return the recordings' files of a folder or file, or of several; raise RecordingError if a folder has none."""
     from go1exp.logs.recording import RecordingError
 
     files: list[Path] = []

@@ -27,7 +27,6 @@ FORMATS = (".mp4", ".gif")
 
 
 def _task(container: dict[str, Any]) -> None:
-
     engine, container = subjects.split_engine(container)
     other, container = subjects.split_robot(container)
     ground = _ground(container.pop("terrain", None))

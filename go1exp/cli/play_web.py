@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -86,22 +87,14 @@ GIVEN = "given"
 
 
 def address(host: str, port: int) -> tuple[str, int]:
-    """Return where to listen.
-
-    Raises:
-        ConfigError: if the host is none.
-    """
+    """Return where to listen; raise ConfigError if the host is none."""
     if not host or any(c.isspace() for c in host) or (":" in host and host.count(":") == 1):
         raise ConfigError([f"host = {host!r}: is the address of an interface, such as 127.0.0.1; see also port={port}"])
     return host, port
 
 
 def require_studio() -> None:
-    """Refuse, before anything is built, where MuJoCo's web viewer is not installed.
-
-    Raises:
-        Expected: in that case.
-    """
+    """Raise Expected if MuJoCo's web viewer is not installed, before anything is built."""
     try:
         server = importlib.util.find_spec("mujoco.studio.web.web_server")
     except ImportError:
@@ -222,18 +215,13 @@ def sim(
         from go1exp.evaluate.viewer.sim_process import RobotProcess
         from go1exp.evaluate.viewer.sim_window import SimShow, SimWindow
 
-        process = RobotProcess(groups, body.tile, config, robot_at, seconds, printed)
+        process = RobotProcess(groups, body.tile, config, robot_at, seconds, partial(print, flush=True))
         try:
             print(greeting(config.start, process.address), flush=True)
             show = SimShow(process, body)
             web.run(show, [SimWindow()], title="go1exp sim", host=where[0], port=where[1])
         finally:
             process.close()
-
-
-def printed(line: str) -> None:
-    """Print a line of the robot, which runs in another process."""
-    print(line, flush=True)
 
 
 def log(file: Path, where: tuple[str, int]) -> None:

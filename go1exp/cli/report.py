@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 
 def _task(container: dict[str, Any]) -> None:
-
     container = dict(container)
     protocols = _protocols(container.pop("protocol"), bool(container.get("eval")))
     settings = parse(ReportSettings, container)

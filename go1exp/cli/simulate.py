@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 from go1exp.cli.app import App, parse_with_groups
@@ -39,7 +40,7 @@ def _task(container: dict[str, Any]) -> int:
     server = Server(Robot(body, config), config, where[1], where[0])
     print(greeting(settings.start, server.address), flush=True)
     try:
-        serve(server, lambda: True, lambda line: print(line, flush=True), settings.seconds)
+        serve(server, lambda: True, partial(print, flush=True), settings.seconds)
     finally:
         server.close()
     return 0

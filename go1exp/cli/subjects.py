@@ -62,11 +62,7 @@ def split_robot(container: dict[str, Any]) -> tuple[dict[str, Any], dict[str, An
 
 
 def with_robot(task: TaskConfig, parts: dict[str, Any]) -> TaskConfig:
-    """Return the task with the other robot in it.
-
-    Raises:
-        ConfigError: if actuator and effects do not go together.
-    """
+    """Return the task with the other robot in it; raise ConfigError if actuator and effects do not go together."""
     from go1exp import robot
     from go1exp.sim.effects.rules import actuator_problems
 

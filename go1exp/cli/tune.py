@@ -22,11 +22,7 @@ FORMS = "key=interval(low,high), key=tag(log,interval(low,high)), key=range(firs
 
 
 def _ranges(space: Sequence[str]) -> dict[str, Range]:
-    """Return what each key is drawn from.
-
-    Raises:
-        ConfigError: with every entry that is no range of a key.
-    """
+    """Return what each key is drawn from; raise ConfigError with every entry that is no range of a key."""
     from go1exp.train.sweep.tune import Range
 
     ranges: dict[str, Range] = {}
@@ -55,7 +51,6 @@ def _empty(drawn: Range) -> str | None:
 
 
 def _task(container: dict[str, Any]) -> int | None:
-
     settings = parse(TuneSettings, container)
     ranges = _ranges(settings.space)
     if importlib.util.find_spec("optuna") is None:

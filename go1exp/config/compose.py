@@ -53,11 +53,7 @@ def compose(
 
 
 def compose_checked(name: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
-    """Compose as ``compose`` does, with the command line's messages.
-
-    Raises:
-        ConfigError: if an override does not fit.
-    """
+    """Compose as ``compose`` does, with the command line's messages; raise ConfigError if an override does not fit."""
     try:
         return compose(name, overrides)
     except (*hydra_adapter.REFUSED, ValueError) as error:

@@ -332,11 +332,7 @@ class Term:
 
 
 def bind_list(group: str, given: Iterable[Any], path: str) -> list[Term]:
-    """Resolve a list of names and of ``{name: {parameter: value}}``.
-
-    Raises:
-        ConfigError: with every problem of them.
-    """
+    """Resolve a list of names and of ``{name: {parameter: value}}``; raise ConfigError with every problem of them."""
     items = [pair for item in given for pair in (item.items() if isinstance(item, Mapping) else [(item, {})])]
     bound = [bind(group, str(key), value, f"{path}.{key}") for key, value in items]
     if problems := [problem for _, term_problems in bound for problem in term_problems]:

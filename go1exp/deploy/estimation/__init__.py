@@ -49,11 +49,7 @@ class EstimatorError(Expected):
 
 
 def compiled() -> ModuleType:
-    """Return the compiled module.
-
-    Raises:
-        EstimatorError: if it was not built, or was built for another Python.
-    """
+    """Return the compiled module; raise EstimatorError if it was not built, or was built for another Python."""
     try:
         return importlib.import_module("go1exp.deploy.estimation._kalman")
     except ImportError as error:
@@ -122,11 +118,7 @@ class Filters:
     """Filters with the settings of the Go1, updated together."""
 
     def __init__(self, count: int) -> None:
-        """Make ``count`` filters.
-
-        Raises:
-            EstimatorError: if the filter is not built.
-        """
+        """Make ``count`` filters; raise EstimatorError if the filter is not built."""
         self._filters = [make_filter(go1()) for _ in range(count)]
 
     def update(self, t: float, measured: Mapping[str, np.ndarray]) -> None:

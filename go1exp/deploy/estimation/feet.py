@@ -39,11 +39,7 @@ class FootCalibration:
     scale: tuple[float, float, float, float] | None = None
 
     def forces(self, counts: np.ndarray) -> np.ndarray:
-        """Return forces (4,), N, for counts (4,).
-
-        Raises:
-            CalibrationError: without scales.
-        """
+        """Return forces (4,), N, for counts (4,); raise CalibrationError without scales."""
         if self.scale is None:
             raise CalibrationError("the feet's calibration has no scales: check=true while the robot stands makes them")
         return (np.asarray(counts, float) - self.zero) / self.scale
@@ -55,11 +51,7 @@ class FootCalibration:
 
     @classmethod
     def read(cls, path: Path) -> FootCalibration:
-        """Read what ``write`` wrote.
-
-        Raises:
-            CalibrationError: if it is no calibration; the message names file and key.
-        """
+        """Read what ``write`` wrote; raise CalibrationError if it is no calibration; the message names file and key."""
         try:
             content = json.loads(Path(path).read_text())
             if not isinstance(content, dict) or not {"zero", "scale"} <= set(content):
@@ -82,11 +74,7 @@ class LoadByBoth:
     """
 
     def __init__(self, config: FilterConfig, calibration: FootCalibration) -> None:
-        """Use the legs of ``config`` and a calibration.
-
-        Raises:
-            CalibrationError: if the calibration has no scales.
-        """
+        """Use the legs of ``config`` and a calibration; raise CalibrationError if the calibration has no scales."""
         calibration.forces(np.zeros(LEGS))  # raises
         self._legs, self._calibration = kinematics(config), calibration
 
@@ -134,11 +122,7 @@ Kinematics = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def kinematics(config: FilterConfig) -> list[Callable[[np.ndarray], Kinematics]]:
-    """Return the compiled kinematics of each leg.
-
-    Raises:
-        go1exp.deploy.estimation.EstimatorError: if the compiled filter is missing.
-    """
+    """Return the compiled kinematics of each leg; raise EstimatorError if the compiled filter is missing."""
     return [leg.foot for leg in compiled_legs(config)]
 
 

@@ -38,11 +38,7 @@ class Constant:
     """A constant velocity; base of the other sources."""
 
     def __init__(self, velocity: Sequence[float]) -> None:
-        """Command the velocity (3,).
-
-        Raises:
-            CommandError: if it is not three finite numbers.
-        """
+        """Command the velocity (3,); raise CommandError if it is not three finite numbers."""
         self._velocity = np.array(velocity, dtype=float)
         if self._velocity.shape != (3,) or not np.isfinite(self._velocity).all():
             raise CommandError(f"command {list(velocity)}: must be three finite numbers: x m/s, y m/s, yaw rad/s")

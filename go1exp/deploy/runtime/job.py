@@ -96,11 +96,7 @@ def _connected(job: Job, bundle: Bundle, say: Say) -> Iterator[tuple[Go1Link, Si
 
 
 def _checked(link: Go1Link, bundle: Bundle, say: Say) -> Findings:
-    """Return the findings about a robot that passes its check.
-
-    Raises:
-        RobotError: if it does not.
-    """
+    """Return the findings about a robot that passes its check; raise RobotError if it does not."""
     about = bundle.metadata
     findings = check(link, about.joints, np.array(about.joint_limits), estimator_settings(about.estimator), say)
     if findings.problems:

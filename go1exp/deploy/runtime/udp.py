@@ -37,11 +37,7 @@ Ancillary = list[tuple[int, int, bytes]]
 
 
 def parsed_address(text: str | None, default: tuple[str, int] = (ROBOT, ROBOT_PORT)) -> tuple[str, int]:
-    """Return host and port of HOST:PORT; ``default`` if None.
-
-    Raises:
-        RobotError: if it is written otherwise.
-    """
+    """Return host and port of HOST:PORT; ``default`` if None; raise RobotError if it is written otherwise."""
     if text is None:
         return default
     host, colon, port = text.rpartition(":")
@@ -96,11 +92,7 @@ class Go1Link:
     """
 
     def __init__(self, host: str = ROBOT, port: int = ROBOT_PORT, tick_s: float = math.nan) -> None:
-        """Open the socket; nothing is sent yet.
-
-        Raises:
-            OSError: if the socket cannot be opened.
-        """
+        """Open the socket; nothing is sent yet; raise OSError if the socket cannot be opened."""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.setblocking(False)
@@ -191,11 +183,7 @@ class Go1Link:
             self.traffic.refused += 1
 
     def send(self, command: LowCmd) -> None:
-        """Send a command, without waiting.
-
-        Raises:
-            ValueError: if a part has another size, or is not finite.
-        """
+        """Send a command, without waiting; raise ValueError if a part has another size, or is not finite."""
         self._packet = go1_wire.pack_command(command)
         self.traffic.sent += 1
         self._put(self._packet)

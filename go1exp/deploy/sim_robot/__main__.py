@@ -11,7 +11,7 @@ import os
 import select
 import signal
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,14 +45,12 @@ def bundle_task(bundle: str, other: dict[str, Any]) -> TaskConfig:
         BundleError: if the file is no bundle.
         ConfigError: if its configuration or the choices are refused.
     """
-    import dataclasses
-
     members = unpack(Path(bundle).read_bytes(), MEMBERS, bundle)
     task = parse_train({**json.loads(members[CONFIG]), **WITHOUT_POLICY}).task
     chosen = {name: value for name, value in other.items() if value is not None}
     parts, problems = parse_parts(chosen, tuple(chosen))
     if not problems:
-        task = dataclasses.replace(task, **parts)
+        task = replace(task, **parts)
         problems = actuator_problems(task.actuator, task.effect, JOINTS)
     if problems:
         raise ConfigError(problems)

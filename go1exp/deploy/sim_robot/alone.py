@@ -27,7 +27,7 @@ def greeting(start: str, address: tuple[str, int]) -> str:
 
 def posture(robot: Robot) -> str:
     """Return what the robot does: its motors, and the height of its trunk."""
-    height = robot.sense_truth()[2]
+    height = robot.truth[2]
     motors = "braking" if robot.braking else ("following commands" if robot.commanded else "holding its pose")
     return f"{motors}, " + ("suspended" if np.isnan(height) else f"trunk at {height:.2f} m")
 

@@ -71,6 +71,9 @@ class Robot:
     Attributes:
         clock: time of the robot, s.
         braking: whether its motors only brake: no command for too long, or a damping command.
+        backend: the physics.
+        readings: at the instant at which the last step began, without noise, by name: ``tau_est`` (12,), N m, ...
+        truth: (13,) position, attitude and velocities of the trunk then, in the columns of ``TRUTH``; NaN if suspended.
     """
 
     def __init__(self, task: TaskConfig | Body, config: SimConfig) -> None:
@@ -89,7 +92,7 @@ class Robot:
         terrain = build_terrain(task.terrain if isinstance(task, Body) else TerrainConfig())
         self._origin = _origin(terrain, task.tile if isinstance(task, Body) else (0, 0))
         model, blocks = build_model(task.robot, terrain, TICK, contact=task.contact, imu=True, held=held)
-        self._backend = backend = MujocoCpu(model, blocks, 1, threads=1)
+        self.backend = backend = MujocoCpu(model, blocks, 1, threads=1)
         random = EnvRandom(config.seed, 1, device=backend.qpos.device)
         self._plant = Plant(backend, actuator_setup(task.robot, TICK, backend, random), task.actuator, task.effect)
         self._plant.startup()
@@ -99,11 +102,6 @@ class Robot:
         self._commanded, self._measured = -np.inf, 0.0
         self._fed: torch.Tensor | None = None  # from the first feed-forward torque on
         self._place()
-
-    @property
-    def backend(self) -> MujocoCpu:
-        """The physics."""
-        return self._backend
 
     def restart(self) -> None:
         """Reset the robot to its initial state without a command; its clock continues."""
@@ -117,8 +115,8 @@ class Robot:
         self.clock, self.braking, self._rng = old.clock, old.braking, old._rng
         self._commanded, self._measured = old._commanded, old._measured
         self._target: torch.Tensor = old._target.clone()
-        self._now: dict[str, np.ndarray] = old._now
-        self._true: np.ndarray = old._true
+        self.readings: dict[str, np.ndarray] = old.readings
+        self.truth: np.ndarray = old.truth
         self._fed = None if old._fed is None else old._fed.clone()
         plant, everyone = self._plant, torch.ones(1, dtype=torch.bool)
         plant.backend.reset(everyone, old.backend.qpos.clone(), old.backend.qvel.clone())
@@ -207,21 +205,16 @@ class Robot:
         rate = speed[:, 3:6] if floats else readings[:, blocks.imu_gyro]
         about = {"acc": readings[:, blocks.imu_acc], "quat": readings[:, blocks.imu_quat]}
         imu = plant.effects.measure(Measured(plant.q, plant.speed(), gyro=rate, **about))
-        readings_now = {"q": q, "qd": qd, "gyro": imu.gyro, "acc": imu.acc, "quat": imu.quat}
-        readings_now |= {"tau_est": plant.reported_torque(), "foot_force": feet}
-        self._now = {name: values[0].numpy().copy() for name, values in readings_now.items() if values is not None}
+        present = {"q": q, "qd": qd, "gyro": imu.gyro, "acc": imu.acc, "quat": imu.quat}
+        present |= {"tau_est": plant.reported_torque(), "foot_force": feet}
+        self.readings = {name: values[0].numpy().copy() for name, values in present.items() if values is not None}
         trunk = torch.cat([pose[:, :7], speed[:, :6]], dim=1)[0].numpy() if floats else np.full(13, np.nan)
-        self._true = np.array(trunk)
+        self.truth = np.array(trunk)
 
     @property
     def commanded(self) -> bool:
         """Whether a command has been applied."""
         return bool(np.isfinite(self._commanded))
-
-    @property
-    def readings(self) -> Mapping[str, np.ndarray]:
-        """Readings without noise at the instant at which the last step began, by name: ``tau_est`` (12,), N m, ..."""
-        return self._now
 
     def pose(self) -> np.ndarray:
         """Return position, attitude and joint angles (19,) after the last step."""
@@ -229,37 +222,25 @@ class Robot:
         held = (0.0, 0.0, HELD_HEIGHT, 1.0, 0.0, 0.0, 0.0)
         return qpos if len(qpos) > robot.NUM_JOINTS else np.concatenate([held, qpos])
 
-    def sense_truth(self) -> np.ndarray:
-        """Return the truth (13,) at the instant at which the last step began (``sense``)."""
-        return self._true
-
     def sense(self) -> tuple[LowState, np.ndarray]:
-        """Return the sensors' readings of the instant at which the last step began, and the truth (13,) then.
-
-        The truth is position, attitude and velocities of the trunk, in the columns of ``TRUTH``; NaN for a suspended
-        robot.
-        """
-        readings = noisy(self._now, self._config.noise, self._rng)
+        """Return the sensors' readings, with noise, and the truth (13,), of the beginning of the last step."""
+        readings = noisy(self.readings, self._config.noise, self._rng)
         state = LowState(
             t=self._measured,
             clock=self._measured,
             joint_pos=readings["q"],
             joint_vel=readings["qd"],
-            joint_torque=self._now["tau_est"],
+            joint_torque=self.readings["tau_est"],
             imu_quat=readings["quat"],
             imu_gyro=readings["gyro"],
             imu_acc=readings["acc"],
             foot_force=readings["foot_force"],
         )
-        return state, self._true
+        return state, self.truth
 
 
 def _origin(terrain: Terrain, tile: tuple[int, int]) -> np.ndarray:
-    """Return the centre of a tile on the ground, (3,), m.
-
-    Raises:
-        ConfigError: if there is no such tile.
-    """
+    """Return the centre of a tile on the ground, (3,), m; raise ConfigError if there is no such tile."""
     rows, columns = terrain.tile_origins.shape[:2]
     if tile[0] >= rows or tile[1] >= columns:
         raise ConfigError([f"tile = {list(tile)}: the ground has {rows} rows and {columns} columns, counted from 0"])

@@ -130,7 +130,7 @@ class Probe:
         if self.server.counts.ticks % EVERY:
             return
         now = self.server.robot.readings
-        parts = (self.server.robot.sense_truth(), now["tau_est"], now["foot_force"])
+        parts = (self.server.robot.truth, now["tau_est"], now["foot_force"])
         self._rows.append(np.concatenate(parts).astype(np.float32))
         self._count += 1
 

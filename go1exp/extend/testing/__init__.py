@@ -16,7 +16,7 @@ from typing import Any
 import go1exp.extend  # noqa: F401  (registers every term)
 from go1exp.config.schema import plugins
 from go1exp.config.schema.registry import Entry
-from go1exp.extend.testing import actuators, motions, randomness, snapshots, traces
+from go1exp.extend.testing import actuators, randomness, snapshots, traces
 from go1exp.extend.testing.description import check_description
 
 CHECKS = {
@@ -29,7 +29,7 @@ CHECKS = {
     "curriculum": randomness.check_curriculum,
     "actuator": actuators.check_actuator,
     "effect": actuators.check_effect,
-    "excitation": motions.check_excitation,
+    "excitation": randomness.check_excitation,
     "measure": traces.check_measure,
 }
 """What a member of a group promises beyond its description; an importer's promises need one of its files."""

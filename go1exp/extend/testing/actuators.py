@@ -15,14 +15,13 @@ from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.config.compose import compose
 from go1exp.config.schema.joint_values import numbers
 from go1exp.config.schema.registry import ConfigError, Entry, Term, bind
-from go1exp.extend.testing.description import alike, checked, expect
+from go1exp.extend.testing.description import ALONE, CONTINUES, MASKED, checked, equal, expect
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.effects.base import Effect
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import MANY_TERMS, TaskConfig, parse_task
 
 PHYSICS_DT = 0.002
-ALONE = "a robot must get the same alone and in a batch"
 
 
 def go1_actuators(n: int, first_env: int = 0, **changes: Any) -> ActuatorSetup:
@@ -79,17 +78,15 @@ def check_actuator(entry: Entry, parameters: dict[str, Any], exact: bool) -> Non
         expect(
             entry, all(torch.equal(a, b) for a, b in zip(inputs, copies, strict=True)), "it must not write its inputs"
         )
-        expect(entry, alike(alone.torque(*(x[3:4] for x in inputs)), torque[3:4], exact), ALONE)
+        expect(entry, equal(alone.torque(*(x[3:4] for x in inputs)), torque[3:4], exact), ALONE)
         if k < 20:
             expect(entry, torch.equal(one.torque(*inputs), torque), "it must do the same with the same inputs")
         if k == 19:
             fresh.load_state_dict(one.state_dict())
             one.reset(torch.arange(5) < 2)
         if k >= 20:
-            expect(
-                entry, torch.equal(fresh.torque(*inputs), torque), "it must continue from its saved state bit for bit"
-            )
-            expect(entry, torch.equal(one.torque(*inputs)[2:], torque[2:]), "reset must touch masked rows only")
+            expect(entry, torch.equal(fresh.torque(*inputs), torque), CONTINUES)
+            expect(entry, torch.equal(one.torque(*inputs)[2:], torque[2:]), MASKED)
 
 
 # ---------------------------------------------------------------------- effects
@@ -181,17 +178,14 @@ def _check_present(entry: Entry, term: Term, steps: int, exact: bool) -> None:
         core.reset()
     together, single = _run(first, steps), _run(alone, steps)
     expect(entry, all(torch.isfinite(x).all() for x in together), "the robot must stay finite")
-    expect(entry, all(alike(a[1:2], b, exact) for a, b in zip(together, single, strict=True)), ALONE)
+    expect(entry, all(equal(a[1:2], b, exact) for a, b in zip(together, single, strict=True)), ALONE)
     second.load_state_dict(first.state_dict())
     ahead = zip(_run(first, 4, steps), _run(second, 4, steps), strict=True)
-    expect(entry, all(torch.equal(a, b) for a, b in ahead), "it must continue from its saved state bit for bit")
+    expect(entry, all(torch.equal(a, b) for a, b in ahead), CONTINUES)
     mask = torch.tensor([True, False, False])
     before = first.plant.effects.effects[term.key].state_dict()
     first.plant.effects.reset(mask)
     after = first.plant.effects.effects[term.key].state_dict()
-    untouched = [torch.equal(after[k][~mask], v[~mask]) for k, v in before.items() if _per_robot(v, 3)]
-    expect(entry, all(untouched), "reset must touch masked rows only")
-
-
-def _per_robot(value: Any, n: int) -> bool:
-    return isinstance(value, Tensor) and value.dim() > 0 and len(value) == n
+    of_robots = {k: v for k, v in before.items() if isinstance(v, Tensor) and v.dim() > 0 and len(v) == 3}
+    untouched = [torch.equal(after[k][~mask], v[~mask]) for k, v in of_robots.items()]
+    expect(entry, all(untouched), MASKED)

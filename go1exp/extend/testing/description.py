@@ -1,4 +1,4 @@
-"""What a term says of itself."""
+"""Checks of a term's description and schema, and what the checks of all kinds share."""
 
 from __future__ import annotations
 
@@ -12,6 +12,11 @@ from go1exp.config.schema.registry import ConfigError, Entry
 RTOL, ATOL = 1e-5, 1e-6
 """What float32 may round differently in a batch of another size."""
 
+ALONE = "a robot must get the same alone and in a batch"
+CONTINUES = "it must continue from its saved state bit for bit"
+MASKED = "reset must touch masked rows only"
+"""Promises of several kinds of terms."""
+
 
 def expect(entry: Entry, holds: Any, promise: str) -> None:
     """Raise AssertionError, naming the term and its place, unless a promise holds."""
@@ -19,7 +24,7 @@ def expect(entry: Entry, holds: Any, promise: str) -> None:
         raise AssertionError(f"{entry.group}.{entry.name} ({entry.place}): {promise}")
 
 
-def alike(a: Tensor, b: Tensor, exact: bool) -> bool:
+def equal(a: Tensor, b: Tensor, exact: bool) -> bool:
     """Return whether two results are the same, to the bit or but for rounding."""
     if a.shape != b.shape or a.dtype != b.dtype:
         return False

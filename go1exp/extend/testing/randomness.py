@@ -1,4 +1,4 @@
-"""What a term promises that draws random numbers or moves robots: randomisations, commands, events, curricula."""
+"""What randomisations, commands, events, curricula and excitations promise: the same for the same seed."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import fields
 from functools import cache
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,7 +15,8 @@ from go1exp import robot
 from go1exp.base.tensors.randomness import EnvRandom, Stream
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import Entry
-from go1exp.extend.testing.description import alike, checked, expect
+from go1exp.extend.testing.description import ALONE, CONTINUES, checked, equal, expect
+from go1exp.logs.excitations import Motion
 from go1exp.mdp.kinematics import KinematicState
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu
 from go1exp.sim.physics.scene import build_model
@@ -22,8 +24,6 @@ from go1exp.sim.task import parse_parts
 from go1exp.sim.terrain import build_terrain
 
 DT = 0.02
-ALONE = "a robot must get the same alone and in a batch"
-CONTINUES = "it must continue from its saved state bit for bit"
 
 
 def stream(n: int, seed: int = 0, first_env: int = 0) -> Stream:
@@ -150,7 +150,7 @@ def check_command(entry: Entry, parameters: dict[str, Any], exact: bool) -> None
             entry, batch.value.shape == (6, 3) and batch.value.dtype == torch.float32, "value must be (N, 3) float32"
         )
         expect(entry, torch.isfinite(batch.value).all(), "value must be finite")
-        expect(entry, alike(batch.value[4:5], alone.value, exact), ALONE)
+        expect(entry, equal(batch.value[4:5], alone.value, exact), ALONE)
         restart = torch.tensor([k % 7 == 0, False, False, k == 3, k % 20 == 0, False])
     expect(
         entry, batch.value is held, "value must be changed in place: a captured GPU graph would not see an assignment"
@@ -180,7 +180,7 @@ def check_event(entry: Entry, parameters: dict[str, Any], exact: bool) -> None:
         alone.advance(single, 1.0, ~everyone(1))
         for name, now in parts(single).items():
             expect(entry, torch.isfinite(now).all(), f"{name} must stay finite")
-            expect(entry, alike(getattr(state, name)[3:4], now, exact), ALONE)
+            expect(entry, equal(getattr(state, name)[3:4], now, exact), ALONE)
 
     def make(random: EnvRandom) -> Any:
         return entry.target(random.stream("event"), **values), start_states(6)
@@ -213,7 +213,7 @@ def _check_continues(
 
 
 def check_curriculum(entry: Entry, parameters: dict[str, Any], exact: bool) -> None:
-    """Keeps levels on the map and judges each robot by itself."""
+    """Keeps levels on the map and treats each robot by itself."""
     rule, n = entry.target(**checked(entry, parameters)), 300
     generator = torch.Generator().manual_seed(0)
     level, anywhere = (torch.randint(0, 10, (n,), generator=generator) for _ in range(2))
@@ -225,3 +225,31 @@ def check_curriculum(entry: Entry, parameters: dict[str, Any], exact: bool) -> N
         row = slice(i, i + 1)
         alone = rule(level[row], walked[row], asked[row], 8.0, 9, anywhere[row])
         expect(entry, torch.equal(alone, after[row]), ALONE)
+
+
+RATE_HZ, SECONDS = 200.0, 20.0
+
+
+def check_excitation(entry: Entry, parameters: dict[str, Any], exact: bool) -> None:
+    """A motion of the Go1's joints within their limits; the same for the same seed."""
+    values = checked(entry, parameters)
+    t = np.arange(round(SECONDS * RATE_HZ)) / RATE_HZ
+    centre, limits = robot.NOMINAL_STANCE.copy(), robot.JOINT_POS_LIMITS.copy()
+
+    def make(seed: int) -> Motion:
+        motion = entry.target(t, centre, limits, np.random.default_rng(seed), **values)
+        expect(entry, isinstance(motion, Motion), "it must return a Motion")
+        return motion
+
+    motion, again = make(0), make(0)
+    expect(entry, motion.target.shape == (len(t), len(centre)), "its targets must be (T, J)")
+    expect(entry, motion.torque_enable.shape == (len(t),), "torque_enable must be (T,)")
+    expect(entry, motion.torque_enable.dtype == bool, "torque_enable must be true or false")
+    expect(entry, motion.start.shape == centre.shape, "its start must be (J,)")
+    for angles in (motion.target, motion.start):
+        within = np.isfinite(angles).all() and (angles >= limits[:, 0]).all() and (angles <= limits[:, 1]).all()
+        expect(entry, within, "it must stay within the joints' limits")
+    same = np.array_equal(motion.target, again.target) and np.array_equal(motion.torque_enable, again.torque_enable)
+    expect(entry, same, "the same seed must give the same motion")
+    kept = np.array_equal(centre, robot.NOMINAL_STANCE) and np.array_equal(limits, robot.JOINT_POS_LIMITS)
+    expect(entry, kept, "it must leave centre and limits as they are")

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from go1exp import robot
 from go1exp.config.schema.registry import Entry
-from go1exp.extend.testing.description import alike, checked, expect
+from go1exp.extend.testing.description import ALONE, CONTINUES, MASKED, checked, equal, expect
 from go1exp.mdp.ground import SCAN_COLUMNS, SCAN_ROWS
 from go1exp.mdp.mirror import Mirror
 from go1exp.mdp.types import Snapshot, TermSetup
@@ -197,10 +197,9 @@ def _check(entry: Entry, values: dict[str, Any], exact: bool, shape: tuple[int, 
         before = random_snapshot(ODD, k)
         same = [torch.equal(getattr(s, f.name), getattr(before, f.name)) for f in fields(Snapshot)]
         expect(entry, all(same), "it must leave the Snapshot as it is")
-        promise = "a robot must get the same alone and in a batch"
         for i, single in singles.items():
-            expect(entry, alike(single(rows(s, slice(i, i + 1))), together[i : i + 1], exact), promise)
-        expect(entry, alike(part(rows(s, slice(0, 8))), together[:8], exact), promise)
+            expect(entry, equal(single(rows(s, slice(i, i + 1))), together[i : i + 1], exact), ALONE)
+        expect(entry, equal(part(rows(s, slice(0, 8))), together[:8], exact), ALONE)
     if entry.remembers:
         _check_memory(entry, values, moments)
 
@@ -222,10 +221,10 @@ def _check_memory(entry: Entry, values: dict[str, Any], moments: list[Snapshot])
     for name, values_now in one.numbers().items():
         if len(values_now) != ODD:
             continue
-        expect(entry, torch.equal(values_now[~mask], other.numbers()[name][~mask]), "reset must touch masked rows only")
+        expect(entry, torch.equal(values_now[~mask], other.numbers()[name][~mask]), MASKED)
         expect(entry, torch.equal(values_now[mask], fresh.numbers()[name][mask]), "reset must forget the masked rows")
     fresh.object.load_state_dict(one.object.state_dict())  # type: ignore[union-attr]
     for s in reversed(moments):
-        expect(entry, torch.equal(one(s), fresh(s)), "it must continue from its saved state bit for bit")
+        expect(entry, torch.equal(one(s), fresh(s)), CONTINUES)
     kept = all(getattr(memory, name) is tensor for name, tensor in held.items())
     expect(entry, kept, "it must change its tensors in place: a captured GPU graph would not see an assignment")
