@@ -152,7 +152,7 @@ def test_a_robot_takes_over_pose_speed_and_command_of_another(here: Here) -> Non
     np.testing.assert_array_equal(new.backend.qpos, old.backend.qpos)
     np.testing.assert_array_equal(new.backend.qvel, old.backend.qvel)
     np.testing.assert_array_equal(new.applied(), old.applied())
-    np.testing.assert_array_equal(new.truth, old.sense_truth())
+    np.testing.assert_array_equal(new.truth, old.truth)
     assert (new.clock, new.commanded, new.braking) == (old.clock, True, False)
     new.step()
     assert new.clock == pytest.approx(old.clock + TICK)

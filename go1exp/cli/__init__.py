@@ -45,10 +45,10 @@ def main() -> int:
     Ctrl-C, SIGTERM and SIGHUP end it with one line at any time; verbs that have something to save handle them first.
     """
     arguments = sys.argv[1:]
-    heard: list[int] = []
+    received: list[int] = []
 
     def interrupt(number: int, frame: FrameType | None) -> None:
-        heard.append(number)
+        received.append(number)
         signals.interrupt(number, frame)
 
     try:
@@ -56,12 +56,12 @@ def main() -> int:
             status = _run(arguments)
             sys.stdout.flush()
             return status
-    except BrokenPipeError:  # who read our output has left, as `| head` does
+    except BrokenPipeError:  # the reader of our output has closed it, as `| head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return READER_LEFT
     except BaseException as error:
         # A library that is interrupted while it is loaded may raise something else.
-        if not heard and not isinstance(error, KeyboardInterrupt):
+        if not received and not isinstance(error, KeyboardInterrupt):
             raise
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # a second Ctrl-C shall not be a traceback
         signals.say(f"{' '.join(['go1exp', *arguments[:1]])}: stopped")

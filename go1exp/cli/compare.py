@@ -70,7 +70,7 @@ def _refuse_rates(named_subjects: list[tuple[Named, Variation]]) -> None:
 
 
 def _with(protocols: list[Chosen], trunk_velocity: Any) -> list[Chosen]:
-    """Return the protocols with another velocity, where a subject asks for that."""
+    """Return the protocols with another velocity, where a subject has one."""
     if trunk_velocity is None:
         return protocols
     return [

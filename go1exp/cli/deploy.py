@@ -47,7 +47,7 @@ class DeploySettings(Stages):
         bundle: file that go1exp export wrote; check=true needs none.
         robot: sim, a simulated robot in another process, or go1, the real one.
         address: HOST:PORT of robot=go1; null takes 192.168.123.10:8007.
-        check: with robot=go1, only look at the robot and calibrate its foot sensors; no torque is ever asked for.
+        check: with robot=go1, only look at the robot and calibrate its foot sensors; no torque is ever commanded.
         feet: calibration of foot sensors that count, a real robot's or those of sim.feet=raw, which check=true writes;
             null takes contact from torques alone, and lets check=true write feet.json in out.
         command: velocity as [x m/s, y m/s, yaw rad/s]; or FILE.csv, sinusoid, keyboard, gamepad.

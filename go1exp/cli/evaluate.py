@@ -158,7 +158,7 @@ def refuse_rates(protocols: Sequence[Chosen], controller: str | None, policy_dt:
     Args:
         protocols: what is to be played.
         controller: name of another controller with a rate of its own, or None.
-        policy_dt: the period that is asked for, s, or None.
+        policy_dt: the period of the policy in place of that of training, s, or None.
     """
     kinds = [c.kind for c in protocols]
     if controller is not None and set(kinds) == {RATES}:
@@ -168,7 +168,7 @@ def refuse_rates(protocols: Sequence[Chosen], controller: str | None, policy_dt:
 
 
 def playable(protocols: Sequence[Chosen], agent: Agent) -> list[Chosen]:
-    """Return the protocols that an agent can play, and say which one of several it cannot."""
+    """Return the protocols that an agent can play, and print which one of several it cannot."""
     if agent.senses and any(c.kind == RATES for c in protocols):
         print(f"{RATES}: not played, it varies the rate of a policy; {agent.label} has one of its own\n")
         return [c for c in protocols if c.kind != RATES]
@@ -191,7 +191,7 @@ def writable_file(out: Path) -> None:
 
 
 def note_replaced(folder: Path, files: Sequence[str]) -> None:
-    """Say which results of an earlier call the new ones will replace."""
+    """Print which results of an earlier call the new ones will replace."""
     present = [name for name in files if (folder / name).exists()]
     if present:
         print(f"note: {folder} holds {', '.join(present)} of an earlier call; new ones replace them (or: folder=NAME)")

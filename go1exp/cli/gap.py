@@ -72,7 +72,7 @@ class GapVerb:
 
 
 DOES_NOT_HOLD = 15
-"""Exit status if what was found is not as good at the step of training."""
+"""Exit status if the certified effects fit worse at the step of training."""
 
 
 def with_logs(container: dict[str, Any]) -> dict[str, Any]:
@@ -172,7 +172,7 @@ def _progress() -> Callable[[str, float], None]:
 
 
 def _check(recordings: list[Recording], robot: Robot, settings: GapVerb) -> int:
-    """Say whether the logs are fit to be compared, their floors, and which effects they could not show."""
+    """Print whether the logs can be compared, their floors, and the effects that are not identifiable from them."""
     from go1exp.gap.stages.check import check
     from go1exp.logs.audit import audit
 
@@ -237,7 +237,7 @@ def _apply(result: GapResult, recordings: list[Recording], robot: Robot, setting
         f"floor ({1 + proof.before:.3g} without; {1 + proof.effect_only:.3g} with {apply.EFFECT} alone)"
     )
     if not proof.holds:
-        better = "in the search it was" if proof.after <= proof.before else "the model as it is has"
+        better = "in the search it was" if proof.after <= proof.before else "the nominal model has"
         least = proof.reported if proof.after <= proof.before else proof.before
         print(f"NOT applied: the error is {1 + proof.after:.3g} with the files at this step; {better} {1 + least:.3g}")
         return

@@ -222,7 +222,7 @@ def _loop(container: dict[str, Any]) -> int:
 
 
 def _keep(turn: Turn, out: Path) -> None:
-    """Write what a round leaves, and say what it found."""
+    """Write the files of a round, and print its row."""
     from go1exp.gap import files
     from go1exp.gap.stages.loop import table
     from go1exp.logs import recording

@@ -27,7 +27,7 @@ WITHOUT = {
     "study": "",
     "terrain": "; without it flat, or that of training with train_ground=true",
 }
-"""Group without a choice of its own -> what its line says of that; all others then keep the choice of training."""
+"""Group without a default choice -> remark in its line; all others then keep the choice of training."""
 
 WITHOUT_IN = {
     ("gap", "contact"): "; without it that which the recordings name, or soft",
@@ -69,7 +69,7 @@ def _words(arguments: Sequence[str]) -> list[str]:
 
 
 def _refuse(title: str, word: str, known: Sequence[str]) -> None:
-    """Say that there is no help for a word, and which ones look like it; leave."""
+    """Print that there is no help for a word, and the nearest ones; exit."""
     from go1exp.config.schema.registry import nearest
 
     close = " or ".join(repr(name) for name in nearest(word, known))

@@ -43,7 +43,7 @@ class Left(BaseException):
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep that Hydra was asked for.
+    """A requested sweep.
 
     Attributes:
         folder: of the sweep.

@@ -116,9 +116,9 @@ def remove_empty(folder: Path) -> None:
 
 
 def long_enough(recordings: list[Recording], least: float) -> list[Recording]:
-    """Return the recordings that windows of ``least`` s can be cut from, and say which are left out and why.
+    """Return the recordings that windows of ``least`` s can be cut from, and print which are left out and why.
 
-    Whether the unit of the times is wrong, the audit's law says (``wrong_steps``).
+    Times in a wrong unit are recognised as by the audit (``wrong_steps``).
     """
     from go1exp.logs.audit.signals import Log
     from go1exp.logs.audit.single import wrong_steps
@@ -167,7 +167,7 @@ def read_all(places: str | Sequence[str]) -> list[Recording]:
 
 
 def _apart(folders: list[Path]) -> list[str]:
-    """Return the ends of paths that tell the folders apart."""
+    """Return the shortest ends of the paths by which the folders differ."""
     parts = next(n for n in count(1) if len({f.parts[-n:] for f in folders}) == len({*folders}))
     return ["/".join(folder.parts[-parts:]) for folder in folders]
 

@@ -133,11 +133,11 @@ class Named:
 
     Attributes:
         label: name in reports.
-        folder: where its results go unless the user says.
+        folder: default place of its results.
         run: run folder, of a run or of a shipped policy.
         checkpoint: one of its checkpoints; None takes the newest.
         bundle: file, in place of a run.
-        controller: in place of a policy; ``run`` then says whose robot it moves.
+        controller: in place of a policy; ``run`` then names the run of the robot that it moves.
     """
 
     label: str

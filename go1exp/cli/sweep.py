@@ -306,6 +306,6 @@ def _report(known: Index, folder: Path) -> int:
 
 
 def _where(numbers: Sequence[int], names: Sequence[str]) -> str:
-    """Say which jobs have a problem: the first of them, and how many more."""
+    """Return which jobs have a problem: the first of them, and how many more."""
     first = f"job {numbers[0]}: {names[numbers[0]]}" if names[numbers[0]] else f"job {numbers[0]}"
     return first if len(numbers) == 1 else f"{first}; and {len(numbers) - 1} more"

@@ -83,7 +83,7 @@ def _source(start_from: str) -> Path:
 
 @dataclass(frozen=True)
 class TrainJob:
-    """One training as it was asked for: its folder, its configuration, and whether it goes on with an older one."""
+    """One requested training: its folder, its configuration, and whether it goes on with an older one."""
 
     run: Path
     config: TrainConfig

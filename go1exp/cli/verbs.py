@@ -9,7 +9,7 @@ from typing import Any
 
 VERBS = {
     "train": "train a policy from configuration",
-    "tune": "search for settings of a training, several at once, the hopeless ones ended early",
+    "tune": "search for settings of a training, several at once, with early stopping (pruning)",
     "eval": "run a trained policy through a grid of commands: errors, falls, a table and JSON",
     "compare": "compare policies on the same protocol and robots: paired differences, a page and JSON",
     "report": "training runs together: learning curves, intervals over seeds, verdicts against a baseline",

@@ -41,7 +41,7 @@ class Plugin:
     """A loaded file or package.
 
     Attributes:
-        name: as it was asked for.
+        name: as it was requested.
         module: under which Python knows it.
         file: of a file, its path.
         content: of a file, what was executed.
@@ -83,7 +83,7 @@ def names(given: Any) -> list[str]:
 
 
 def load(*wanted: str) -> list[Plugin]:
-    """Load plugins for the rest of the process, whatever configurations say.
+    """Load plugins for the rest of the process, whatever the configuration.
 
     Args:
         wanted: paths of files (ending in ``.py``) and names of packages.
@@ -180,7 +180,7 @@ def installed() -> list[Plugin]:
 
 
 def origin(entry: Entry) -> str | None:
-    """Return the plugin that a member is from, as it was asked for; None for one of this package."""
+    """Return the plugin that a member is from, as it was requested; None for one of this package."""
     return next((p.name for p in in_force() if any(e is entry for e in p.entries)), None)
 
 
@@ -255,7 +255,7 @@ class _FromContent(importlib.machinery.SourceFileLoader):
         return self._content
 
     def path_stats(self, path: Any) -> Any:
-        """Say that nothing is known that byte code could be compared with."""
+        """Raise OSError: there is no byte code to compare with."""
         raise OSError
 
 
@@ -289,7 +289,7 @@ def _import(module: str, name: str, file: Path | None) -> Plugin:
 
 
 def _reason(error: BaseException, module: str, name: str, file: Path | None) -> str:
-    """Say in one line what went wrong where in a plugin."""
+    """Return the error of a plugin and its place in one line."""
     if isinstance(error, DuplicateError):
         return str(error)
     if isinstance(error, ModuleNotFoundError) and file is None and module.startswith(str(error.name)):

@@ -84,7 +84,7 @@ class ConfigError(ValueError):
 
 
 class TooLongError(ConfigError):
-    """A length of time that does not fit into memory: its setting is at fault, whatever it is asked of."""
+    """A length of time that does not fit into memory: its setting is wrong whatever it is for."""
 
 
 class DuplicateError(ValueError):
@@ -168,7 +168,7 @@ def _is_member(place: int | str) -> bool:
 
 @dataclass(frozen=True)
 class Entry:
-    """One registered member: its group, name and target, and what the group wants to know about it (``traits``)."""
+    """One registered member: its group, name and target, and what the group needs to know about it (``traits``)."""
 
     group: str
     name: str

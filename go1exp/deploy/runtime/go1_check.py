@@ -103,16 +103,16 @@ def listen(
     sleep: Callable[[float], None] = time.sleep,
 ) -> Observed:
     """Receive states for ``seconds`` s; no torque is commanded."""
-    heard, begin = Observed(), now()
+    observed, begin = Observed(), now()
     while now() - begin < seconds:
         states = link.receive()
         if states:
-            heard.states.extend(states)
-            heard.ticks.append((link.tick or 0, states[-1].t))
+            observed.states.extend(states)
+            observed.ticks.append((link.tick or 0, states[-1].t))
         sleep(PERIOD)
-    heard.seconds = now() - begin
-    heard.health = link.health
-    return heard
+    observed.seconds = now() - begin
+    observed.health = link.health
+    return observed
 
 
 @dataclass(frozen=True)
@@ -135,65 +135,67 @@ class Findings:
 
 
 def evaluated(
-    heard: Observed, link: Go1Link, joints: Sequence[str], stops: np.ndarray, config: FilterConfig, bounds: Bounds
+    observed: Observed, link: Go1Link, joints: Sequence[str], stops: np.ndarray, config: FilterConfig, bounds: Bounds
 ) -> Findings:
     """Return the findings.
 
     Args:
-        heard: states, by ``listen``.
+        observed: states, by ``listen``.
         link: counts the rejected packets.
         joints: names, 12.
         stops: (12, 2) hard stops, rad.
         config: has the legs.
         bounds: limits.
     """
-    if len(heard.states) < 2 or heard.health is None:
+    if len(observed.states) < 2 or observed.health is None:
         why = ", ".join(f"{count} x {name}" for name, count in link.traffic.refused_because.items())
-        heard_so_far = f"{len(heard.states)} states in {heard.seconds:.1f} s"
+        received = f"{len(observed.states)} states in {observed.seconds:.1f} s"
         refused = f"; rejected: {why}" if why else "; nothing arrived: is this computer in the robot's network?"
-        return Findings((), (f"no robot: {heard_so_far}{refused}",))
-    lines, problems = [*_packets(heard, link)], [*_packet_problems(heard, link, bounds)]
+        return Findings((), (f"no robot: {received}{refused}",))
+    lines, problems = [*_packets(observed, link)], [*_packet_problems(observed, link, bounds)]
     for evaluate in (_battery, _joints, _trunk):
-        findings, wrong = evaluate(heard, joints, stops, bounds)
+        findings, wrong = evaluate(observed, joints, stops, bounds)
         lines += findings
         problems += wrong
-    up = vertical(heard.mean("imu_quat"))
-    counts = heard.mean("foot_force")
-    force = forces_by_torque(heard.mean("joint_pos"), heard.mean("joint_torque"), up, kinematics(config))
-    spread = np.std([state.foot_force for state in heard.states], axis=0)
+    up = vertical(observed.mean("imu_quat"))
+    counts = observed.mean("foot_force")
+    force = forces_by_torque(observed.mean("joint_pos"), observed.mean("joint_torque"), up, kinematics(config))
+    spread = np.std([state.foot_force for state in observed.states], axis=0)
     lines.append(
         "feet FR FL RR RL: counts " + " ".join(f"{c:.0f}±{s:.1f}" for c, s in zip(counts, spread, strict=True))
     )
     lines.append("  vertical force from the torques " + " ".join(f"{value:.0f}" for value in force) + " N")
-    return Findings(tuple(lines), tuple(problems), heard.tick_s, counts, force)
+    return Findings(tuple(lines), tuple(problems), observed.tick_s, counts, force)
 
 
-def _packets(heard: Observed, link: Go1Link) -> list[str]:
-    gaps, traffic = 1e3 * heard.intervals, link.traffic
+def _packets(observed: Observed, link: Go1Link) -> list[str]:
+    gaps, traffic = 1e3 * observed.intervals, link.traffic
     p50, p99 = np.percentile(gaps, [50, 99])
-    unit = f"{heard.tick_s:g} s" if math.isfinite(heard.tick_s) else "unknown; times of arrival are used"
+    unit = f"{observed.tick_s:g} s" if math.isfinite(observed.tick_s) else "unknown; times of arrival are used"
     refused = ", ".join(f"{count} x {why}" for why, count in traffic.refused_because.items()) or "none"
     counted = f"rejected: {refused}; late or duplicate: {traffic.late}"
-    delay = spread(heard.delays)
+    delay = spread(observed.delays)
     relative = "unknown" if delay is None else ", ".join(f"{name} {1e3 * v:.2f}" for name, v in delay.items()) + " ms"
     return [
-        f"packets: {_rate(heard):.0f} per second; interval p50 {p50:.2f}, p99 {p99:.2f}, worst {gaps.max():.2f} ms",
+        f"packets: {_rate(observed):.0f} per second; interval p50 {p50:.2f}, p99 {p99:.2f}, worst {gaps.max():.2f} ms",
         f"  {counted}; unit of the tick: {unit}",
         f"  delay relative to the fastest packet: {relative}",
     ]
 
 
-def _rate(heard: Observed) -> float:
-    return (len(heard.states) - 1) / max(heard.states[-1].t - heard.states[0].t, 1e-9)
+def _rate(observed: Observed) -> float:
+    return (len(observed.states) - 1) / max(observed.states[-1].t - observed.states[0].t, 1e-9)
 
 
-def _packet_problems(heard: Observed, link: Go1Link, bounds: Bounds) -> list[str]:
+def _packet_problems(observed: Observed, link: Go1Link, bounds: Bounds) -> list[str]:
     problems = []
-    if _rate(heard) < bounds.rate:
-        problems.append(f"packets: {_rate(heard):.0f} per second; at least {bounds.rate:.0f} are needed")
-    if heard.intervals.max() > bounds.gap:
-        problems.append(f"packets: {1e3 * heard.intervals.max():.0f} ms without one; {1e3 * bounds.gap:.0f} is a fault")
-    share = link.traffic.foreign / (link.traffic.foreign + len(heard.states))
+    if _rate(observed) < bounds.rate:
+        problems.append(f"packets: {_rate(observed):.0f} per second; at least {bounds.rate:.0f} are needed")
+    if observed.intervals.max() > bounds.gap:
+        problems.append(
+            f"packets: {1e3 * observed.intervals.max():.0f} ms without one; {1e3 * bounds.gap:.0f} is a fault"
+        )
+    share = link.traffic.foreign / (link.traffic.foreign + len(observed.states))
     if share > bounds.refused:
         problems.append(f"packets: {100 * share:.1f} % rejected; at most {100 * bounds.refused:.0f} % are allowed")
     return problems
@@ -202,8 +204,8 @@ def _packet_problems(heard: Observed, link: Go1Link, bounds: Bounds) -> list[str
 Evaluated = tuple[list[str], list[str]]
 
 
-def _battery(heard: Observed, joints: Sequence[str], stops: np.ndarray, bounds: Bounds) -> Evaluated:
-    health = heard.health
+def _battery(observed: Observed, joints: Sequence[str], stops: np.ndarray, bounds: Bounds) -> Evaluated:
+    health = observed.health
     assert health is not None
     volts = [value for value in health.cell_voltage if value > 0.0] or [math.nan]
     hottest = int(np.argmax(health.motor_temperature))
@@ -222,8 +224,8 @@ def _battery(heard: Observed, joints: Sequence[str], stops: np.ndarray, bounds: 
     return lines, problems
 
 
-def _joints(heard: Observed, joints: Sequence[str], stops: np.ndarray, bounds: Bounds) -> Evaluated:
-    q, qd = heard.mean("joint_pos"), np.abs([state.joint_vel for state in heard.states]).mean(axis=0)
+def _joints(observed: Observed, joints: Sequence[str], stops: np.ndarray, bounds: Bounds) -> Evaluated:
+    q, qd = observed.mean("joint_pos"), np.abs([state.joint_vel for state in observed.states]).mean(axis=0)
     beyond = np.maximum(stops[:, 0] - q, q - stops[:, 1])
     lines, problems = ["joints, rad (range of the model):"], []
     for k in range(0, len(joints), 3):
@@ -239,8 +241,8 @@ def _joints(heard: Observed, joints: Sequence[str], stops: np.ndarray, bounds: B
     return lines, problems
 
 
-def _trunk(heard: Observed, joints: Sequence[str], stops: np.ndarray, bounds: Bounds) -> Evaluated:
-    quat, acc = heard.mean("imu_quat"), float(np.linalg.norm(heard.mean("imu_acc")))
+def _trunk(observed: Observed, joints: Sequence[str], stops: np.ndarray, bounds: Bounds) -> Evaluated:
+    quat, acc = observed.mean("imu_quat"), float(np.linalg.norm(observed.mean("imu_acc")))
     length, angle = float(np.linalg.norm(quat)), tilt_angle(quat)
     problems = []
     if not abs(length - 1.0) <= SafetyConfig.quat_error:

@@ -69,7 +69,7 @@ class Outcome:
         commands: with the number of limited commands.
         estimator: number of samples that it left out, by status, and of restarts.
         memory_mb: resident memory at the end; None if unknown.
-        requested_by: who requested its orderly end, such as a key; empty if its time was up.
+        requested_by: origin of the request of its orderly end, such as a key; empty if its time was up.
     """
 
     fault: Fault | None

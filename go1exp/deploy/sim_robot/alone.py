@@ -22,7 +22,7 @@ def greeting(start: str, address: tuple[str, int]) -> str:
     """Return the line with the address of a robot, host and port, and a second one if others can reach it."""
     host, port = address
     line = f"a Go1 ({start}) listens at {host}:{port}; Ctrl-C ends it"
-    return line if host == HOST else f"{line}\nnote: anybody in the network can command it"
+    return line if host == HOST else f"{line}\nnote: any computer in the network can command it"
 
 
 def posture(robot: Robot) -> str:

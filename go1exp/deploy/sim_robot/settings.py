@@ -39,7 +39,7 @@ class SimSettings(SimConfig):
     """``conf/sim.yaml`` without the groups.
 
     Attributes:
-        address: HOST:PORT to listen at; another host than 127.0.0.1 opens it to the network, to everybody in it.
+        address: HOST:PORT to listen at; another host than 127.0.0.1 opens it to every computer in the network.
         tile: row and column of its initial tile of terrain=rough; difficulty grows with the row.
         seconds: how long it runs, s; null until Ctrl-C.
         viewer: web shows it in the browser, with the timing of its client; null prints lines alone.

@@ -142,7 +142,7 @@ def _bound(entry: Entry, values: dict[str, Any]) -> Term:
 
 
 def check_effect(entry: Entry, parameters: dict[str, Any], exact: bool) -> None:
-    """Says what its parameters are; is not there at its null values; keeps what it remembers.
+    """Parameters with units and bounds; no effect at its null values; a state that is saved and restored.
 
     Parameters other than the null ones are needed for the rest: by default five tolerances, as far as the bounds go.
     """
