@@ -77,7 +77,7 @@ def test_results_of_a_shipped_policy_do_not_go_into_the_package() -> None:
     assert trained(None, "paper", "eval.json", "mine.json")[1] == Path("mine.json")
 
 
-KNOWN_MISSES = {
+KNOWN_MISSES: dict[str, set[str]] = {
     "trot": set(),
     "paper": set(),
     "robust": set(),
