@@ -25,8 +25,13 @@ DT, SUBSTEPS = 0.02, 10
 TROT, PRONK, HOP = (0.0, 0.5, 0.5, 0.0), (0.0, 0.0, 0.0, 0.0), (0.0, 0.11, 0.71, 0.05)
 
 
-def walk(phase: tuple[float, ...], rate: float = 2.0, command: float = 1.0, seconds: float = 5.0) -> GaitLog:
-    """The log of two robots whose feet land at ``phase`` cycles after FR with 1 m/s and 200 N."""
+def walk(
+    phase: tuple[float, ...], rate: float = 2.0, command: float = 1.0, seconds: float = 5.0, bounce: float = 0.0
+) -> GaitLog:
+    """The log of two robots whose feet land at ``phase`` cycles after FR with 1 m/s and 200 N.
+
+    ``bounce`` cycles after touchdown and before liftoff they come off the ground for as long.
+    """
     log, feet = GaitLog(2, DT, torch.device("cpu")), Feet(2, 0.002, torch.device("cpu"))
     plain = random_snapshot(2)
     still = {"command": torch.tensor([[command, 0.0, 0.0]] * 2), "foot_vel_w": torch.zeros(2, 4, 3)}
@@ -40,6 +45,8 @@ def walk(phase: tuple[float, ...], rate: float = 2.0, command: float = 1.0, seco
             turn = (rate * (step * DT + 0.002 * k) - offset + 1e-6) % 1.0
             force = torch.zeros(2, 4, 3)
             force[..., 2] = torch.where(turn < 0.003, 200.0, torch.where(turn < 0.5, 50.0, 0.0))
+            off = ((turn > bounce) & (turn < 2 * bounce)) | ((turn > 0.5 - 2 * bounce) & (turn < 0.5 - bounce))
+            force[..., 2][:, off] = 0.0
             feet.update(force, velocity)
         now = {"foot_force": force.norm(dim=-1), **still, **feet.snapshot_fields()}
         log.add(dataclasses.replace(plain, **now))
@@ -57,6 +64,12 @@ def test_a_gait_made_by_hand_has_its_rate_duty_and_error_to_a_trot(phase: tuple[
     assert figures["contact/touchdown_speed"] == pytest.approx(1.0)
     assert figures["contact/largest_force"] == 200.0
     assert figures["contact/slip_share"] == 0.0
+
+
+def test_bounces_are_no_touchdowns() -> None:
+    figures = walk(TROT, bounce=0.03).drain()
+    assert figures["gait/stride_rate"] == pytest.approx(2.0, rel=0.11)
+    assert figures["gait/trot_error"] < 0.05  # of an instant that is known to a bounce and a policy step
 
 
 def test_trembling_shows_as_a_stride_rate() -> None:
@@ -105,7 +118,7 @@ def test_a_checkpoint_of_before_is_refused_in_a_line(
 
 
 def test_the_environment_logs_the_same_figures_after_a_pause(make_core: Callable[..., Go1Core]) -> None:
-    overrides = ("rand=table1", "sim.episode_s=0.4", "command.hold_time=[0.06,0.4]")
+    overrides = ("rand=table1", "sim.episode_s=0.4", "command.hold_time=[0.06,0.4]", "contact=soft", "actuator=pd")
     straight, first, second = (make_core(*overrides, num_envs=4) for _ in range(3))
     action = torch.as_tensor(torch.randn(30, 4, 12, generator=torch.Generator().manual_seed(0)))
     for core in (straight, first):

@@ -28,6 +28,10 @@ LONGEST_STRIDE = 1.0
 FAST = 0.2
 """Speed at which a foot on the ground slips, m/s."""
 
+BOUNCE = 0.03
+"""A swing shorter than this is a bounce, s (chosen): on stiff ground feet come off it for some milliseconds as they land
+and as they lift off."""
+
 LEGS = robot.NUM_LEGS
 FR = robot.LEGS.index("FR")
 OTHERS = slice(FR + 1, LEGS)  # a list of indices would be copied to the GPU at each step
@@ -44,7 +48,7 @@ GAIT_SUMS = {
 class GaitLog(Memory):
     """Gait and contact: sums since the last ``drain``, and the past that each robot's phases need."""
 
-    memory = ("sums", "largest", "since", "period", "stance_peak")
+    memory = ("sums", "largest", "since", "period", "swing", "stance_peak")
 
     def __init__(self, num_envs: int, dt: float, device: torch.device) -> None:
         """Start with nothing; ``dt`` is the policy's period, s."""
@@ -53,6 +57,7 @@ class GaitLog(Memory):
         self.largest, self.impossible = torch.zeros(2, device=device).unbind(0)
         self.since = torch.full((num_envs,), torch.inf, device=device)  # FR's last touchdown, s ago
         self.period = torch.zeros(num_envs, device=device)  # of its last stride, s
+        self.swing = torch.zeros(num_envs, LEGS, device=device)  # longest since the last touchdown that counted, s
         self.stance_peak = torch.zeros(num_envs, LEGS, device=device)
         self._trot = torch.tensor(TROT, device=device)
 
@@ -61,7 +66,11 @@ class GaitLog(Memory):
         assert s.foot_peak_force is not None
         assert s.foot_touchdown_speed is not None
         moving = (s.command != 0.0).any(-1, keepdim=True)
-        landed = s.foot_touchdown & moving
+        airborne = torch.where(s.foot_touchdown, s.foot_last_air_time, s.foot_air_time)
+        swing = torch.maximum(self.swing, airborne)
+        touchdown = s.foot_touchdown & (swing > BOUNCE)
+        self.swing.copy_(torch.where(touchdown, s.foot_air_time, swing))
+        landed = touchdown & moving
         contact = s.foot_contact.float()
         errors, phases = self._phase_errors(s, landed)
         fast = contact * (slip_speed(s) > FAST)
@@ -95,6 +104,7 @@ class GaitLog(Memory):
         """Forget the past of the rows of ``mask`` (N,)."""
         self.since.masked_fill_(mask, torch.inf)
         self.period.masked_fill_(mask, 0.0)
+        self.swing.masked_fill_(mask.unsqueeze(-1), 0.0)
         self.stance_peak.masked_fill_(mask.unsqueeze(-1), 0.0)
 
     def drain(self) -> dict[str, float]:
@@ -102,7 +112,7 @@ class GaitLog(Memory):
 
         ``gait/`` is of robots with a non-zero command.
 
-        ``gait/stride_rate``: touchdowns of a foot per second, Hz, bounces longer than a policy step included.
+        ``gait/stride_rate``: touchdowns of a foot per second, Hz, without bounces (``BOUNCE``).
         ``gait/trot_error``: mean circular distance of touchdowns to a trot's, cycles, of the worst foot; 0.25 for
         random ones, and never less than the measure, which averages phases first. ``gait/duty_mean``, ``duty_spread``
         (largest less smallest foot), ``gait/load_share_min``: of the batch's mean force. ``contact/slip_share``,
