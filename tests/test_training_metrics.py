@@ -120,7 +120,7 @@ def test_a_checkpoint_of_before_is_refused_in_a_line(
 def test_the_environment_logs_the_same_figures_after_a_pause(make_core: Callable[..., Go1Core]) -> None:
     overrides = ("rand=table1", "sim.episode_s=0.4", "command.hold_time=[0.06,0.4]", "contact=soft", "actuator=pd")
     straight, first, second = (make_core(*overrides, num_envs=4) for _ in range(3))
-    action = torch.as_tensor(torch.randn(30, 4, 12, generator=torch.Generator().manual_seed(0)))
+    action = 3.0 * torch.randn(30, 4, 12, generator=torch.Generator().manual_seed(0))
     for core in (straight, first):
         core.reset()
     for k in range(30):

@@ -29,8 +29,8 @@ FAST = 0.2
 """Speed at which a foot on the ground slips, m/s."""
 
 BOUNCE = 0.03
-"""A swing shorter than this is a bounce, s (chosen): on stiff ground feet come off it for some milliseconds as they land
-and as they lift off."""
+"""A swing shorter than this is a bounce, s (chosen): feet come off stiff ground for some milliseconds as they land and
+as they lift off."""
 
 LEGS = robot.NUM_LEGS
 FR = robot.LEGS.index("FR")
