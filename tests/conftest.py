@@ -31,7 +31,7 @@ from go1exp.sim.actuator.actuator_net import ActuatorNet, NetInfo, Provenance, g
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TaskConfig, parse_task
 from tests.selection import changed_since, chosen
-from tests.small_run import made_once, trained
+from tests.small_run import made_once, plain, trained
 
 torch.set_num_threads(1)
 
@@ -117,7 +117,7 @@ def composed(overrides: tuple[str, ...], folder: str) -> dict[str, Any]:
 @pytest.fixture(scope="session")
 def make_task() -> Callable[..., TaskConfig]:
     """Parse the environment's configuration from command-line overrides."""
-    return lambda *overrides: parse_task(deepcopy(composed(overrides, os.getcwd())))
+    return lambda *overrides: parse_task(deepcopy(composed(plain(*overrides), os.getcwd())))
 
 
 @pytest.fixture

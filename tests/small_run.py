@@ -14,6 +14,16 @@ from go1exp.sim.task import parse_train
 from go1exp.train import run_folder, trainer
 from go1exp.train.ppo import AdaptivePPO
 
+PLAIN = {"actuator": "pd", "contact": "soft"}
+
+
+def plain(*overrides: str) -> tuple[str, ...]:
+    """Add actuators without latency and soft ground to the overrides of a task, unless they choose others."""
+    chosen = {override.partition("=")[0] for override in overrides}
+    if "experiment" in chosen:
+        return overrides
+    return (*(f"{key}={value}" for key, value in PLAIN.items() if key not in chosen), *overrides)
+
 
 def small(*overrides: str, **ppo: object) -> tuple[str, ...]:
     """Return the overrides of the smallest training that leaves a run folder.
@@ -23,7 +33,7 @@ def small(*overrides: str, **ppo: object) -> tuple[str, ...]:
     sizes = {"num_envs": 4, "steps": 4, "minibatches": 2, "epochs": 1, "hidden": "[16,8]", "iterations": 2, **ppo}
     sizes.setdefault("schedule", "fixed")
     machine = ("backend.threads=1", "torch_threads=1", "logger.tensorboard=false")
-    return (*(f"ppo.{key}={value}" for key, value in sizes.items()), *machine, *overrides)
+    return plain(*(f"ppo.{key}={value}" for key, value in sizes.items()), *machine, *overrides)
 
 
 SMALL = small()

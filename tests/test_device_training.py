@@ -24,7 +24,7 @@ from go1exp.train.ppo import AdaptivePPO, linear_rate
 
 SMALL = (
     *("ppo=paper", "ppo.num_envs=8", "ppo.steps=6", "ppo.hidden=[16,8]", "sim.episode_s=0.2"),
-    *("backend.threads=1", "torch_threads=1", "logger=local"),
+    *("backend.threads=1", "torch_threads=1", "logger=local", "actuator=pd", "contact=soft"),
 )
 
 

@@ -27,6 +27,7 @@ from go1exp.sim.physics.mujoco_cpu import MujocoCpu
 from go1exp.sim.physics.scene import build_model
 from go1exp.sim.task import TaskConfig, parse_task
 from go1exp.sim.terrain import build_terrain
+from tests.small_run import plain
 
 G = 9.81
 CALVES = slice(2, None, 3)
@@ -43,7 +44,7 @@ def engine(plant: Plant) -> MujocoCpu:
 
 
 def task() -> TaskConfig:
-    return parse_task(compose("train", ["rand=none", "backend.threads=1"]))
+    return parse_task(compose("train", plain("rand=none", "backend.threads=1")))
 
 
 def rig(

@@ -33,6 +33,7 @@ from go1exp.sim.physics.mujoco_cpu import MujocoCpu
 from go1exp.sim.physics.scene import build_model
 from go1exp.sim.task import MANY_TERMS, TaskConfig, parse_task
 from go1exp.sim.terrain import build_terrain
+from tests.small_run import plain
 
 DT = 0.002
 CALF = robot.JOINTS.index("FR_calf")
@@ -44,7 +45,7 @@ Slow = Callable[..., float]
 
 @cache
 def task() -> TaskConfig:
-    return parse_task(compose("train", ["backend.threads=1"]))
+    return parse_task(compose("train", plain("backend.threads=1")))
 
 
 def term(group: str, name: str, values: Values) -> Term:

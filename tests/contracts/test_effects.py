@@ -39,6 +39,7 @@ from go1exp.sim.physics.mujoco_cpu import MujocoCpu
 from go1exp.sim.physics.scene import Sensors, build_model
 from go1exp.sim.task import MANY_TERMS, TaskConfig, parse_task
 from go1exp.sim.terrain import build_terrain
+from tests import small_run
 
 DT = 0.002
 EFFECTS, EXCITATIONS = members("effect"), members("excitation")
@@ -69,7 +70,7 @@ def is_null(kind: type[Effect], values: Mapping[str, JointValues]) -> bool:
 
 @cache
 def task() -> TaskConfig:
-    return parse_task(compose("train", ["backend.threads=1"]))
+    return parse_task(compose("train", small_run.plain("backend.threads=1")))
 
 
 @cache
