@@ -102,7 +102,7 @@ def test_a_file_in_place_of_recordings_an_answer_or_options_is_called_one(run: R
     said = "notes.txt: is a file; out must be the folder of an answer, with verdict.json"
     assert run("gap", "report", "out=notes.txt") == (1, f"go1exp gap: {said}\n")
     (tmp_path / "verdict.json").write_text("{}")
-    said = "verdict.json: not a result of go1exp gap (has no 'named'); run go1exp gap explain again"
+    said = "verdict.json: not a result of go1exp gap (has no 'verdict'); run go1exp gap explain again"
     assert run("gap", "report", "out=.") == (1, f"go1exp gap: {said}\n")
     status, err = run("record", "import", "csv", "notes.txt", "options=notes.txt")
     assert (status, err.startswith("go1exp record import: options=notes.txt: must be a mapping")) == (2, True), err

@@ -142,6 +142,8 @@ NEEDS = {
         "observation.gait_clock.rate=3.1",  # neither the file's nor the experiment's, which the rewards take over
     ],
     "experiment/five_minutes": ["reward=clock"],
+    "actuator/delay": ["schedule=none"],  # which begins without latency
+    "command/widening": ["schedule=none"],  # which begins without slow commands
     "experiment/ablation/no_latency": ["actuator=delay"],
     "experiment/ablation/no_adaptive_rate": ["ppo=paper"],
     "experiment/five_minutes_part/no_mirrored_samples": ["ppo=small"],

@@ -54,8 +54,13 @@ def parse(settings: Any, parts: Mapping[str, Any]) -> tuple[dict[str, Ramp], lis
             problems.append(f"schedule.{key}.set = {ramp.path!r}: is set by schedule.{setters[ramp.path]} too")
         setters[ramp.path] = key
         problems += _target_problems(f"schedule.{key}", ramp, parts)
-    known = changeable(parts)
-    return {key: ramp for key, ramp in ramps.items() if ramp.path in known or not ramp.optional}, problems
+    return {key: ramp for key, ramp in ramps.items() if not _left_out(ramp, parts)}, problems
+
+
+def _left_out(ramp: Ramp, parts: Mapping[str, Any]) -> bool:
+    """Return whether a ramp is optional and the task lacks its setting, or sets it for each robot."""
+    taken = ramp.path == CONTACT_TIME and _contact_problems("", parts)
+    return ramp.optional and (ramp.path not in changeable(parts) or bool(taken))
 
 
 def _with_end(ramp: Ramp, parts: Mapping[str, Any]) -> Ramp:
@@ -80,7 +85,8 @@ def changeable(parts: Mapping[str, Any]) -> list[str]:
     paths = [f"reward.{t.key}.{name}" for t in parts.get("reward") or () for name in (WEIGHT, *_numbers(t))]
     command = parts["command"].parameters if parts.get("command") else {}
     shares = [path for path in SHARES if command.get(path.removeprefix("command."))]
-    return [*paths, *([DELAY] if _is_delay(parts) else []), CONTACT_TIME, *shares]
+    contact = [CONTACT_TIME] if parts.get("contact") else []
+    return [*paths, *([DELAY] if _is_delay(parts) else []), *contact, *shares]
 
 
 def _numbers(term: Term) -> list[str]:
@@ -97,10 +103,10 @@ def _is_delay(parts: Mapping[str, Any]) -> bool:
 
 def _target_problems(path: str, ramp: Ramp, parts: Mapping[str, Any]) -> list[str]:
     """Return what is wrong with the setting that a ramp names and with its two values."""
+    if _left_out(ramp, parts):
+        return []
     known = changeable(parts)
     if ramp.path not in known:
-        if ramp.optional:
-            return []
         if ramp.path == DELAY and parts.get("actuator"):
             return [f"{path}.set = {DELAY!r}: needs actuator=delay"]
         if ramp.path in SHARES:

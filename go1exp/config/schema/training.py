@@ -247,7 +247,8 @@ class Ramp(Strict):
         over: time that the ramp takes, in unit; 0 is a jump.
         when: start at a metric's threshold instead, {measure, below or above, iterations}.
         unit: steps of all robots together, or iterations, which suit small and large batches alike.
-        optional: leave the ramp out of a task without this setting, such as a delay with actuator=pd.
+        optional: leave the ramp out of a task without this setting, such as a delay with actuator=pd, or
+            where it is drawn for each robot.
     """
 
     path: Annotated[str, Field(alias="set")]
