@@ -116,7 +116,7 @@ def test_a_walk_stands_a_network_that_loses_doubles_delays_damages_and_replays(b
 def walking(tmp_path_factory: pytest.TempPathFactory) -> str:
     """The shipped policy as a bundle."""
     path = tmp_path_factory.mktemp("paper") / "walk.zip"
-    path.write_bytes(build(shipped_policies()["paper"], seconds=0.2))
+    path.write_bytes(build(shipped_policies()["robust_history"], seconds=0.2))
     return str(path)
 
 

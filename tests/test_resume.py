@@ -171,7 +171,8 @@ def test_in_the_reference_everything_random_happens(flat: Path) -> None:
     counters = {name: int(c) for name, c in state["env"]["random"].items() if name != "seed"}
     assert min(counters[name] for name in ("command", "event.push", "noise", "rand.foot_friction")) > 0
     fields = state["env"]["backend"]["fields"]
-    assert all(len(field.flatten(1).unique(dim=0)) == 8 for field in fields.values())  # no robot like another
+    drawn = [field for name, field in fields.items() if name != "geom_solref"]  # which the schedule sets, for all alike
+    assert all(len(field.flatten(1).unique(dim=0)) == 8 for field in drawn)  # no robot like another
 
 
 def test_only_the_newest_checkpoints_stay(flat: Path) -> None:

@@ -42,7 +42,10 @@ SMALL = (
     *("sim.episode_s=0.2", "backend.threads=1", "torch_threads=1", "logger=local"),
 )
 
-WORLD = ("rand=none", "event=none", "backend.threads=1", *(f"++observation.{name}.noise=0.0" for name in TERMS))
+WORLD = (
+    *("rand=none", "event=none", "actuator=pd", "contact=soft", "backend.threads=1"),
+    *(f"++observation.{name}.noise=0.0" for name in TERMS),
+)
 """Nothing is random, and every registered observation is seen."""
 
 

@@ -399,7 +399,7 @@ def test_a_time_beyond_the_ends_is_an_end() -> None:
 
 
 def test_own_effects_of_a_run_that_do_nothing_are_off(robots: Robots) -> None:
-    subject = named(None, "paper", None, None, "play.mp4")
+    subject = named(None, "robust", None, None, "play.mp4")
     task = agent(subject, {}).task
     _, sizes = catalogue(task.effect, False)
     assert [name for name, size in sizes.items() if size] == []

@@ -152,8 +152,7 @@ class Go1Core:
     def change(self, path: str, value: Value) -> None:
         """Change a setting of a running environment (``sim/schedule.py``), in place: a captured step sees it too.
 
-        A delay counts from each robot's next episode on, a share of commands from each robot's next command on,
-        everything else from the next step on.
+        A delay counts from each robot's next episode on, a share of commands from its next command, all else at once.
         """
         if path == DELAY:
             self.plant.actuator.set_range(*value)  # type: ignore[attr-defined, misc]  # checked with the schedule
