@@ -22,7 +22,7 @@ def plain(*overrides: str) -> tuple[str, ...]:
     chosen = {override.partition("=")[0] for override in overrides}
     if "experiment" in chosen:
         return overrides
-    return (*(f"{key}={value}" for key, value in PLAIN.items() if key not in chosen), *overrides)
+    return (*overrides, *(f"{key}={value}" for key, value in PLAIN.items() if key not in chosen))
 
 
 def small(*overrides: str, **ppo: object) -> tuple[str, ...]:

@@ -73,7 +73,9 @@ def test_a_step_holds_nothing_that_a_graph_cannot(choices: tuple[str, ...], make
 
 
 def test_a_step_whose_settings_change_holds_nothing_that_a_graph_cannot(make_task: Callable[..., TaskConfig]) -> None:
-    core = Go1Core(make_task("reward=paper", "command=widening", "backend.threads=1"), 4, changing=CHANGING)
+    core = Go1Core(
+        make_task("reward=paper", "actuator=delay", "command=widening", "backend.threads=1"), 4, changing=CHANGING
+    )
     for path in CHANGING:
         core.change(path, (0.0, 0.01) if path == "actuator.command" else 0.01)
     core.reset()

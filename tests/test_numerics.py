@@ -52,7 +52,7 @@ BARS: dict[str, tuple[tuple[float, float, float], str]] = {
 
 @cache
 def task() -> TaskConfig:
-    return parse_task(compose("train", ["rand=none", "backend.threads=1"]))
+    return parse_task(compose("train", ["rand=none", "actuator=pd", "contact=soft", "backend.threads=1"]))
 
 
 def held(dt: float, mounted: bool = False) -> tuple[mujoco.MjModel, Sensors]:

@@ -136,7 +136,7 @@ def test_a_spring_that_the_step_cannot_resolve_stays_stable_and_deflects_as_much
 
 @cache
 def task() -> TaskConfig:
-    return parse_task(compose("train", ["rand=none", "backend.threads=1"]))
+    return parse_task(compose("train", ["rand=none", "actuator=pd", "contact=soft", "backend.threads=1"]))
 
 
 def hanging(dt: float, rows: list[Mapping[str, float]], mount: bool = True) -> Plant:

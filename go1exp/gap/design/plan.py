@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Annotated, Any, ClassVar, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from pydantic import ConfigDict, Field
@@ -15,8 +15,10 @@ from go1exp.base.errors import Expected
 from go1exp.config.schema.registry import STRICT, NonNegative, Positive, Term, bind, members
 from go1exp.gap.data.windows import Windows
 from go1exp.gap.result import Count
-from go1exp.gap.robots.protocol import Robot
 from go1exp.logs.excitations import ExcitationError, Motion
+
+if TYPE_CHECKING:
+    from go1exp.gap.robots.protocol import Robot
 
 Part = Annotated[float, Field(gt=0, le=1)]
 
