@@ -144,6 +144,7 @@ NEEDS = {
     "experiment/five_minutes": ["reward=clock"],
     "actuator/delay": ["schedule=none"],  # which begins without latency
     "command/widening": ["schedule=none"],  # which begins without slow commands
+    "contact/elliptic": ["schedule=none"],  # which begins on soft ground
     "experiment/ablation/no_latency": ["actuator=delay"],
     "experiment/ablation/no_adaptive_rate": ["ppo=paper"],
     "experiment/five_minutes_part/no_mirrored_samples": ["ppo=small"],
