@@ -57,7 +57,7 @@ SIZES = {
     "full": Size(
         robots=tuple(hidden.SECRETS),
         # A policy that has seen ideal drives on nominal robots only.
-        task=("experiment=trot", "actuator=pd", "~actuator.command", "effect=none", "rand=none"),
+        task=("experiment=trot", "actuator=pd", "effect=none", "rand=none"),
         first=(),
         walker=("ppo.iterations=50",),
         # At the task's 3e-4 one update of one of 21 trainings threw its policy away.
