@@ -309,8 +309,8 @@ def report(sides: Sequence[Side]) -> str:
     return "\n".join(lines)
 
 
-def lacking(folder: Path) -> list[str]:
-    """Return the dependencies of mjlab that a folder lacks, one line each."""
+def missing_packages(folder: Path) -> list[str]:
+    """Return the dependencies of mjlab that are not in a folder, one line each."""
     installed = {d.metadata["Name"].lower().replace("_", "-"): d.version for d in distributions(path=[str(folder)])}
     return [
         f"{name} {wanted}".strip() + (f" (there is {installed[name]})" if name in installed else "")
@@ -349,9 +349,9 @@ def main(arguments: Sequence[str]) -> int:
             serve(lambda: mjlab_loop(num_envs, device, its_steps_setting == "true"))
         return 0
     folder = Path(given["site"]).expanduser().resolve()
-    if missing := lacking(folder):
+    if missing := missing_packages(folder):
         raise SystemExit(
-            f"site={folder}: lacks {', '.join(missing)}. To make it, with the torch and warp that are here:\n"
+            f"site={folder}: misses {', '.join(missing)}. To make it, with the torch and warp that are here:\n"
             f"  {sys.executable} -m pip install --target FOLDER mjlab=={NEEDS['mjlab']} {' '.join(pins())}"
         )
 

@@ -4,8 +4,8 @@
         [jobs=1] [threads=2]
 
 For each hidden robot (``benchmarks/gap/hidden.py``, physics that is not the library's) ``go1exp gap`` writes an
-``effect.yaml`` from its recordings, hung, or on its feet where those give no effect. Then the policy is fine-tuned
-with it, and with equally many steps on the plain model and with an actuator net fitted to hung recordings.
+``effect.yaml`` from its recordings, suspended, or standing where those give no effect. Then the policy is fine-tuned
+with it, and with equally many steps on the plain model and with an actuator net fitted to suspended recordings.
 All four policies walk on the hidden robot with the same seeds. Each of the three is trained ``trainings`` times, with
 seeds of their own: a training alone says little. Writes ``robots.json``, ``robots.csv`` and
 ``closed_loop.json``. What is done already is not done again, so an interrupted run goes on. ``jobs`` robots are worked
@@ -111,7 +111,7 @@ def tuned(place: Place, run: Path, *words: str) -> list[Path]:
 
 
 def searched(place: Place, name: str, support: str) -> dict[str, Any]:
-    """Return what ``go1exp gap`` says of a robot by its logs of one support, hung or on the ground.
+    """Return what ``go1exp gap`` says of a robot by its logs of one support, suspended or on the ground.
 
     ``file`` is the ``effect.yaml``, which has what is certified; where nothing is, it is empty.
     """
@@ -131,13 +131,13 @@ def searched(place: Place, name: str, support: str) -> dict[str, Any]:
 
 
 def named_effects(place: Place, name: str) -> dict[str, Any]:
-    """Return what ``go1exp gap`` says by the hung logs, or by those on its feet if the hung ones give no effect."""
-    verdict = searched(place, name, "hung")
+    """Return what ``go1exp gap`` says by the suspended logs, or by the standing ones if those give no effect."""
+    verdict = searched(place, name, "suspended")
     return verdict if verdict["certain"] else searched(place, name, "ground")
 
 
 def fitted_net(place: Place, name: str) -> Path:
-    """Return the actuator net fitted to hung recordings of a robot at the gains of its policy."""
+    """Return the actuator net fitted to suspended recordings of a robot at the gains of its policy."""
     out, logs = place.named(name, "net_fit"), place.named(name, "hung_for_net")
     if not finished(out):
         record(place, name, logs)
@@ -168,22 +168,22 @@ def record(place: Place, name: str, folder: Path) -> None:
     if finished(folder):
         return
     size, robot = place.size, hidden.make(name, place.seed, place.size.ground)
-    if folder.name == "hung":
+    if folder.name == "suspended":
         made = hidden.record_hung(robot, name, place.seed, size.recordings, size.seconds)
     elif folder.name == "hung_for_net":
         made = hidden.record_for_net(robot, name, place.seed, *size.for_net)
     else:
-        policy, told = deployed(place.named("walker")), np.array(size.commands[:2])
-        made = hidden.record_ground(robot, name, place.seed, size.recordings, size.seconds, policy, told)
+        policy, commanded = deployed(place.named("walker")), np.array(size.commands[:2])
+        made = hidden.record_ground(robot, name, place.seed, size.recordings, size.seconds, policy, commanded)
     logger.save(folder, made)
     finish(folder, episodes=len(made))
 
 
-def judge(place: Place, robot: hidden.Hidden, run: Path, file: Path) -> None:
+def evaluate(place: Place, robot: hidden.Hidden, run: Path, file: Path) -> None:
     """Write the errors of a policy's walks on a robot, m/s, and its falls, unless they are there."""
     if not file.is_file():
         size = place.size
-        errors, fell = hidden.judged(robot, deployed(run), size.commands, size.walks, size.walk_s, place.seed)
+        errors, fell = hidden.evaluated(robot, deployed(run), size.commands, size.walks, size.walk_s, place.seed)
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(json.dumps({"errors": errors.round(6).tolist(), "fell": fell.tolist()}) + "\n")
 
@@ -191,20 +191,20 @@ def judge(place: Place, robot: hidden.Hidden, run: Path, file: Path) -> None:
 # ---------------------------------------------------------------------- the whole
 
 
-def hung(place: Place, name: str) -> None:
-    """Do what a robot needs before there is a policy: hung logs, the search in them, and the actuator net."""
-    searched(place, name, "hung")
+def suspended(place: Place, name: str) -> None:
+    """Do what a robot needs before there is a policy: suspended logs, the search in them, and the actuator net."""
+    searched(place, name, "suspended")
     fitted_net(place, name)
 
 
-def judge_nominal(place: Place) -> None:
+def evaluate_nominal(place: Place) -> None:
     """Let the policy that all others start from walk on the robot of which the model is right."""
-    judge(place, hidden.nominal(place.size.ground), walker(place), place.named("walks_nominal.json"))
+    evaluate(place, hidden.nominal(place.size.ground), walker(place), place.named("walks_nominal.json"))
 
 
 def robot_of(place: Place, name: str) -> tuple[dict[str, Any], dict[str, Walks]]:
     """Record a robot, name its gap, fine-tune, and let all four policies walk on it."""
-    hung(place, name)
+    suspended(place, name)
     net = place.named(name, "net_fit", "net.npz")
     through_net = ("actuator=net", f"actuator.file={net}", "actuator.period=resample")
     runs = {
@@ -220,7 +220,7 @@ def robot_of(place: Place, name: str) -> tuple[dict[str, Any], dict[str, Walks]]
         endings = [run.name.removeprefix(of_policy[0].name) for run in of_policy]
         files = [place.named(name, f"walks_{policy}{ending}.json") for ending in endings]
         for run, file in zip(of_policy, files, strict=True):
-            judge(place, robot, run, file)
+            evaluate(place, robot, run, file)
         walks[policy] = Walks.read(*files)
     return verdict, walks
 
@@ -233,14 +233,14 @@ def in_turn(place: Place, names: Sequence[str]) -> Iterator[tuple[dict[str, Any]
     if place.jobs == 1:
         walker(place)
         tuned(place, place.named("plain"))
-        judge_nominal(place)
+        evaluate_nominal(place)
         yield from (robot_of(place, name) for name in names)
         return
     with ProcessPoolExecutor(place.jobs, get_context("spawn"), torch.set_num_threads, (1,)) as pool:
-        early = {pool.submit(hung, place, name): name for name in names}
+        early = {pool.submit(suspended, place, name): name for name in names}
         walker(place)
         tuned(place, place.named("plain"))
-        nominal = pool.submit(judge_nominal, place)
+        nominal = pool.submit(evaluate_nominal, place)
         whole: dict[str, Future[tuple[dict[str, Any], dict[str, Walks]]]] = {}
         for done in as_completed(early):
             done.result()

@@ -30,7 +30,7 @@ class Walks:
 
     @classmethod
     def read(cls, *files: Path) -> Walks:
-        """Read what ``judge`` wrote, a file of each training."""
+        """Read what ``evaluate`` wrote, a file of each training."""
         each = [json.loads(file.read_text()) for file in files]
         return cls(np.array([w["errors"] for w in each]), np.array([w["fell"] for w in each], dtype=bool))
 

@@ -22,12 +22,12 @@ class Size:
         tuned: further ones of every fine-tuning, the number of its iterations among them.
         physics_dt: step of fine-tuning, s.
         ground: that the robots walk on, where they hide none.
-        recordings: hung ones of each robot, and squats.
+        recordings: suspended ones of each robot, and squats.
         seconds: of each recording.
         search: further settings of ``go1exp gap``.
-        for_net: further hung ones, which the actuator net alone is fitted to, and their seconds.
+        for_net: further suspended ones, which the actuator net alone is fitted to, and their seconds.
         net: further settings of ``go1exp fit-actuator``.
-        commands: of the walks that are judged, m/s, m/s, rad/s.
+        commands: of the walks that are evaluated, m/s, m/s, rad/s.
         walks: with each command.
         walk_s: of each walk, s.
     """
@@ -74,7 +74,7 @@ SIZES = {
         walk_s=10.0,
     ),
     "small": Size(
-        robots=("friction", "late"),  # those on their feet take minutes more
+        robots=("friction", "late"),  # those that stand take minutes more
         task=("experiment=five_minutes",),
         first=(),
         walker=("sim.physics_dt=0.005", "ppo.iterations=30"),

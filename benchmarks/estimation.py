@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from benchmarks.mocap import Judgement, judge
+from benchmarks.mocap import Evaluation, evaluate
 from go1exp.base.paths import data_root
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import bind
@@ -91,33 +91,33 @@ def speed() -> None:
 
 
 def real(folder: Path, leave_one_out: bool) -> None:
-    """Print the table of SCALER's walks; a run that cannot be judged has its reason there."""
-    judgements: dict[Path, Judgement] = {}
+    """Print the table of SCALER's walks; a run that cannot be evaluated has its reason there."""
+    evaluations: dict[Path, Evaluation] = {}
     print("| run | distance, m | odometry: v RMSE | distance | filter: v RMSE | distance | clock |")
     print("|---|---|---|---|---|---|---|")
     for file in files(folder, "*.npz"):
         try:
-            j = judge(file, scaler())
+            j = evaluate(file, scaler())
         except RecordingError as error:
             print(f"| {file.stem} | left out: {error} |")
             continue
-        judgements[file] = j
+        evaluations[file] = j
         odometry = f"{j.odometry_rmse:.3f} | {100 * j.odometry_distance:+.1f} %"
         filtered = f"{j.filter_rmse:.3f} | {100 * j.filter_distance:+.1f} %"
         clock = f"{j.clock_shift:+.2f} s" if j.clock_shift else ""
         print(f"| {j.run} | {j.truth_distance:.2f} | {odometry} | {filtered} | {clock} |")
-    if not judgements:
+    if not evaluations:
         return
-    runs = list(judgements.values())
+    runs = list(evaluations.values())
     columns = [
         (np.mean([j.odometry_rmse for j in runs]), np.mean([abs(j.odometry_distance) for j in runs])),
         (np.mean([j.filter_rmse for j in runs]), np.mean([abs(j.filter_distance) for j in runs])),
     ]
     print("| mean (distance: of sizes) | | " + " | ".join(f"{v:.3f} | {100 * d:.1f} %" for v, d in columns) + " | |")
-    if leave_one_out and len(judgements) > 1:
-        errors = np.array([[judge(f, scaler(foot_drift=d)).filter_distance for d in DRIFTS] for f in judgements])
+    if leave_one_out and len(evaluations) > 1:
+        errors = np.array([[evaluate(f, scaler(foot_drift=d)).filter_distance for d in DRIFTS] for f in evaluations])
         held = []
-        for k in range(len(judgements)):
+        for k in range(len(evaluations)):
             others = np.delete(errors, k, axis=0)
             held.append(errors[k, np.argmin((others**2).mean(axis=0))])
         print(

@@ -1,4 +1,4 @@
-"""What gait terms pay for which gait: ``python -m benchmarks.gait_scores [simulate=true]``.
+"""What gait terms give to which gait: ``python -m benchmarks.gait_scores [simulate=true]``.
 
 Patterns made by hand pass through the foot timers at 2 ms and are scored every 20 ms, as in training; ``bounces``
 adds what simulated feet do as they lift off and land. Beside the
@@ -70,7 +70,7 @@ def pattern(rate: float, offset: Sequence[float], duty: float | Sequence[float] 
 
 
 def robots(timers: FootTimers) -> Any:
-    """Return what a gait term looks at: robots that are told to walk, with these timers."""
+    """Return what a gait term looks at: robots that are commanded to walk, with these timers."""
     n = len(timers.air)
     return SimpleNamespace(
         command=torch.tensor([0.5, 0.0, 0.0]).expand(n, 3),

@@ -33,8 +33,8 @@ PLAN: dict[str, tuple[int, str]] = {
 METHODS: dict[str, tuple[str, dict[str, str]]] = {
     "whole": ("the search as it is", {}),
     "no_box": ("no tolerance box: nominal values stay nominal; one term", {"calibrate": "false", "max_terms": "1"}),
-    "gain": ("judged by the gain alone, no max-T", {"judge": "gain"}),
-    "bic": ("judged by BIC, not by held-out windows", {"judge": "bic"}),
+    "gain": ("selected by the gain alone, no max-T", {"selection": "gain"}),
+    "bic": ("selected by BIC, not by held-out windows", {"selection": "bic"}),
     "no_adequacy": ("no absolute adequacy", {"adequate": "1e9"}),
     "sysid": ("mujoco.sysid, everything at once", {}),
 }
@@ -90,7 +90,7 @@ def rows_of(out: Path) -> list[dict[str, Any]]:
         results = score.read_results(out / method) if (out / method).is_dir() else {}
         if not results:
             continue
-        figures = score.judge({name: answers[name] for name in results}, results).figures
+        figures = score.evaluate({name: answers[name] for name in results}, results).figures
         row: dict[str, Any] = {"method": method, "about": about, "cases": len(results)}
         for name in (*SHOWN, "seconds_per_case"):
             value, low, high, n = figures[name]

@@ -21,7 +21,7 @@ from benchmarks.gap import cases, generate, score
 from benchmarks.results import write_results
 
 PLAN: dict[str, tuple[int, str]] = {
-    "single": (2 * len(cases.HUNG), "2,5"),
+    "single": (2 * len(cases.SUSPENDED), "2,5"),
     "pair": (14, "1,2,5"),
     "outside": (11, "1,2,5"),
     "damaged": (8, "1,2,5"),
@@ -46,7 +46,7 @@ def merged(out: Path, kinds: Sequence[str]) -> score.Score:
             raise SystemExit(f"{out / kind}: its answers are not those that were sealed")
         answers |= json.loads(text)
         results |= score.read_results(out / f"out_{kind}")
-    return score.judge(answers, results)
+    return score.evaluate(answers, results)
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -1,10 +1,10 @@
-"""Robot seconds until two effects that look alike are told apart: by ``gap next``, standard recordings, random designs.
+"""Robot seconds until two similar effects are separated: by ``gap next``, standard recordings, random designs.
 
     python -m benchmarks.gap_next out=DIR [pairs=tilt,kd] [strategies=next,standard] [n=2] [designs=24] [most=6]
         [seconds=6] [search=true] [jobs=1]
 
 A simulated Go1 has one effect of a pair, whose size is taken as known. It is first recorded in slow ramps, 2 x 3 s.
-Recordings of ``seconds`` are added one by one until the rival, fitted to all of them, is told apart with a power of
+Recordings of ``seconds`` are added one by one until the rival, fitted to all of them, is separated with a power of
 80 %. The power is computed on the windows of the recordings, not of the rehearsals. With ``search``, ``go1exp gap`` is
 then asked what it makes of them, with no knowledge of the pair: whether the hidden effect is named, with how many
 equals, and whether a certified name is wrong. Writes ``OUT/next.json``, a row for each pair, strategy and seed, and
@@ -54,7 +54,7 @@ GAINS = ((20.0, 0.5), (35.0, 0.6), (35.0, 1.2))
 
 KINDS = ("chirp", "steps", "slow_ramps")
 STRATEGIES = ("next", "standard", "random")
-TOLD_APART = "told apart"
+SEPARATED = "separated"
 
 Row = dict[str, Any]
 """What one strategy took for one pair and seed."""
@@ -179,15 +179,15 @@ def _usual() -> Iterator[tuple[str, tuple[float, float]]]:
 def run(
     case: Case, strategy: str, seed: int, most: int, settings: DesignSettings, threads: int, search: bool = False
 ) -> Row:
-    """Add recordings until the pair is told apart; return what it took."""
+    """Add recordings until the pair is separated; return what it took."""
     bench, usual, begun = Bench(case, seed, threads), _usual(), time.perf_counter()
     powers: list[float] = []
-    ended = "not told apart"
+    ended = "not separated"
     for turn in range(most + 1):
         comparison, evaluator, power = bench.evaluated()
         powers.append(power)
         if power >= ENOUGH:
-            ended = TOLD_APART
+            ended = SEPARATED
             break
         if turn == most:
             break
@@ -215,14 +215,14 @@ def run(
 def ratios(rows: Sequence[Row], most: int, seconds_each: float) -> list[float]:
     """Return, for each pair and seed, the robot seconds of ``next`` over those of the standard recordings.
 
-    What was not told apart took one recording more than the most that were made. That is too little, so a ratio to
-    standard recordings that did not tell the two apart is too large. Pairs that neither told apart have no ratio.
+    A pair that was not separated counts as one recording more than were made. That is too little, so a ratio to
+    standard recordings that did not separate the two is too large. Pairs that neither separated have no ratio.
     """
     late = seconds_each * (most + 1)
     seconds: dict[tuple[str, str, int], dict[str, float]] = {}
     for row in rows:
         pair = seconds.setdefault((row["truth"], row["rival"], row["seed"]), {})
-        pair[row["strategy"]] = row["seconds"] if row["ended"] == TOLD_APART else late
+        pair[row["strategy"]] = row["seconds"] if row["ended"] == SEPARATED else late
     both = [(each["next"], each["standard"]) for each in seconds.values() if {"next", "standard"} <= {*each}]
     # Nor has a pair that the recordings at hand tell apart.
     return [a / b for a, b in both if min(a, b) < late and b > 0.0]

@@ -5,7 +5,7 @@
 Writes ``OUT/<case>/verdict.json`` (``OUT`` is the cases' folder unless given), which ``benchmarks.gap.score`` reads.
 Knows the nominal model and the logs, no answer; a case that has its verdict is skipped, so that an interrupted run goes
 on. ``key=value`` of :class:`~go1exp.gap.result.GapSettings` make ablations: ``calibrate=false`` (no tolerance box),
-``judge=gain`` (no max-T), ``judge=bic`` (no held-out judgement), ``adequate=1e9`` (no absolute adequacy).
+``selection=gain`` (no max-T), ``selection=bic`` (no held-out test), ``adequate=1e9`` (no absolute adequacy).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 CASES_A_PROCESS = 4
-"""Cases that a process solves before another takes its place: what a heap has grown to is not given back."""
+"""Cases that a process solves before another takes its place: what a heap has grown to is not returned."""
 
 
 def solve(case: Path, out: Path, settings: dict[str, Any]) -> str:

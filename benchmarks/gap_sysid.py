@@ -172,7 +172,7 @@ class Fit:
 
 
 def identify(recordings: Sequence[Recording]) -> dict[str, Any]:
-    """Fit the first recordings, judge on the rest, and return what ``verdict.json`` holds."""
+    """Fit the first recordings, test on the rest, and return what ``verdict.json`` holds."""
     if not all(r.meta.kp and r.meta.kd and r.meta.base == "fixed" for r in recordings):
         raise RecordingError("kp, kd and base=fixed are needed")
     sd = np.concatenate([noise(recordings, "q"), noise(recordings, "qd")])
@@ -228,7 +228,7 @@ def solve(case: Path, out: Path) -> str:
 def require() -> None:
     """Raise SystemExit without the extra."""
     if not hasattr(sysid, "optimize"):
-        raise SystemExit('mujoco.sysid lacks its own dependencies: pip install "mujoco[sysid]"')
+        raise SystemExit('mujoco.sysid needs its dependencies: pip install "mujoco[sysid]"')
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -45,7 +45,7 @@ HIDDEN: dict[str, tuple[str, float]] = {
 """Effect -> its parameter, and in which direction it leaves its null value."""
 
 USUAL = "coulomb,viscous,armature,torque_delay,command_delay,strength"
-"""Effects that are hidden unless told otherwise: those that a leg in the air feels."""
+"""Effects that are hidden by default: those that a leg in the air feels."""
 
 NULLS: tuple[Mapping[str, Mapping[str, float]], ...] = (
     {},

@@ -27,7 +27,7 @@ WINDOW = 15
 
 
 @dataclass(frozen=True)
-class Judgement:
+class Evaluation:
     """Errors of filter and odometry on one run.
 
     Attributes:
@@ -89,13 +89,13 @@ def odometry(rows: np.ndarray, config: FilterConfig) -> np.ndarray:
     return Rotation.from_quat(rows[:, column.QUAT], scalar_first=True).apply(mean)
 
 
-def judge(path: Path, config: FilterConfig, log: Log = SCALER_LOG) -> Judgement:
+def evaluate(path: Path, config: FilterConfig, log: Log = SCALER_LOG) -> Evaluation:
     """Compare filter and odometry with motion capture, from 0.05 s after a run's start to its end.
 
     Odometry gets the same joint angles at the same times as the filter.
 
     Raises:
-        RecordingError: if the run lacks joints, IMU or motion capture.
+        RecordingError: if the run has no joints, IMU or motion capture.
         EstimatorError: if the filter is not built.
     """
     (recording,) = import_recordings("scaler_walk_mocap", path, {})
@@ -118,7 +118,7 @@ def judge(path: Path, config: FilterConfig, log: Log = SCALER_LOG) -> Judgement:
         return float(np.sqrt(np.mean(error**2))), _distance(interp1d(result.t, position_w, axis=0)(grid)) / distance - 1
 
     filtered = errors(rotation.apply(result.velocity_b), result.position_w)
-    return Judgement(path.stem, distance, *filtered, *errors(leg_velocity, leg_place), capture.shift)
+    return Evaluation(path.stem, distance, *filtered, *errors(leg_velocity, leg_place), capture.shift)
 
 
 def _distance(place: np.ndarray) -> float:

@@ -3,8 +3,8 @@
     python benchmarks/paper_loop.py run=RUN [out=DIR] [seconds=15]
 
 RUN is a run folder trained with ideal drives (``go1exp train experiment=demo``). Prints the
-RMSE of the joint angles of a hung robot against those with the hidden drive, under the same targets in closed loop, for
-ideal PD drives and for the net.
+RMSE of the joint angles of a suspended robot against those with the hidden actuator, under the same targets in closed
+loop, for ideal PD actuators and for the net.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ PERFECT = Channel(0.0, 0.0)
 
 
 def trajectories(overrides: list[str]) -> dict[str, np.ndarray]:
-    """Return the joint angles (T, 12) of a hung robot on motions that no recording has, without a logger's errors."""
+    """Return noise-free joint angles (T, 12) of a suspended robot on motions that no recording has."""
     container = compose("record", overrides)
     parts, problems = parse_parts(container, RIG)
     assert not problems, problems

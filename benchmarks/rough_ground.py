@@ -1,7 +1,7 @@
 """Falls of a policy on the ground of training: ``python -m benchmarks.rough_ground run=FOLDER [speed=1.0]``.
 
 As many robots on each level and kind of tile as there are columns of it, the noise and randomisation of training, no
-pushes, told to walk forward at ``speed`` m/s for ``seconds``; headings are random. A robot that leaves the map counts
+pushes, a commanded ``speed`` m/s forward for ``seconds``; headings are random. A robot that leaves the map counts
 as left and not as walked through. A shipped policy is ``run=assets/policies/NAME``. ``ground`` is the run whose terrain
 it is, where that is another: policies are compared on one ground.
 """

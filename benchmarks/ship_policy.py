@@ -5,7 +5,7 @@
 Writes ``assets/policies/NAME``: the run's configuration and origin, its curves (every tenth iteration), a checkpoint
 that holds only the policy (without what only training needs), and evaluations on the CPU engine: on flat ground
 with noise, with nothing random (``rand=none``), with noise at 100 Hz, on the ground of training with all that training
-does to a robot, and as policies are judged (``go1exp/evaluate/criteria.py``): stiff feet, dry friction, late targets.
+does to a robot, and under the acceptance criteria (``go1exp/evaluate/criteria.py``): stiff feet, dry friction, delay.
 ``first`` is the run that ``run`` started from (``start_from``): its configuration, origin and curves go to
 ``first_stage``. Without ``run`` the present policy is evaluated again.
 """
@@ -47,7 +47,7 @@ EVALUATIONS: dict[str, dict[str, Any]] = {
 }
 """Evaluation -> settings that differ from the default."""
 
-JUDGED_GRID = {
+CRITERIA_GRID = {
     "x": (0.1, 0.2, 0.3, 0.5, 1.0, 1.5, 2.0, 3.0, -1.0),
     "y": (0.5, -0.5),
     "yaw": (1.0, -0.6, 1.8),
@@ -85,11 +85,11 @@ def copy_origin(run: Path, to: Path) -> None:
     (to / "metrics.csv").write_text("".join([head, *rows[9::EVERY]]))
 
 
-def judge(task: TaskConfig, policy: Policy, about: dict[str, Any]) -> dict[str, Any]:
+def evaluate_criteria(task: TaskConfig, policy: Policy, about: dict[str, Any]) -> dict[str, Any]:
     """Return the report of a policy on ``criteria.ROBOT``: 20 robots a command, 10 s, noise; and its delay margin."""
     other, _ = subjects.split_robot(compose("eval", list(ROBOT)))
     changed = subjects.with_robot(task, other)
-    commands = (*grid(JUDGED_GRID["x"], JUDGED_GRID["y"], JUDGED_GRID["yaw"], cross=False), COMBINED)
+    commands = (*grid(CRITERIA_GRID["x"], CRITERIA_GRID["y"], CRITERIA_GRID["yaw"], cross=False), COMBINED)
     config = EvalConfig(commands, 20, 10.0, 2.0, True, True, False, False, None, 1)
     report = {"policy": about, "robot": subjects.robot_as_data(other)}
     report |= evaluate(changed, policy, config, measures=every_measure())
@@ -101,9 +101,9 @@ def main(arguments: Sequence[str]) -> None:
     """Copy and evaluate."""
     given = dict(a.split("=", 1) for a in arguments if "=" in a)
     if not {"name"} <= set(given) <= {"run", "name", "first", "episodes", "only"} or given.get(
-        "only", "judged"
-    ) not in (*EVALUATIONS, "judged"):
-        known = "|".join((*EVALUATIONS, "judged"))
+        "only", "criteria"
+    ) not in (*EVALUATIONS, "criteria"):
+        known = "|".join((*EVALUATIONS, "criteria"))
         raise SystemExit(
             f"usage: python -m benchmarks.ship_policy [run=RUN] name=NAME [first=RUN] [episodes=31] [only={known}]"
         )
@@ -124,9 +124,9 @@ def main(arguments: Sequence[str]) -> None:
         wanted = EvalConfig(commands, int(given.get("episodes", 31)), **{**usual, **off, **on})
         report = {"policy": about, **evaluate(config.task, policy, wanted, measures=every_measure())}
         write(report, to / f"eval_{name}.json")
-    if given.get("only", "judged") == "judged":
-        print("== judged", flush=True)
-        write(judge(config.task, policy, about), to / "eval_judged.json")
+    if given.get("only", "criteria") == "criteria":
+        print("== criteria", flush=True)
+        write(evaluate_criteria(config.task, policy, about), to / "eval_criteria.json")
 
 
 def write(report: dict[str, Any], file: Path) -> None:

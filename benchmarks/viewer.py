@@ -43,22 +43,22 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=30.0, help="how long to count")
     parser.add_argument("--drawn", action="store_true", help="let Chromium draw in software")
     options = parser.parse_args()
-    with shown() as told, Browser(1280, 800, scale=1.0 if options.drawn else 0.1) as browser:
+    with shown() as page, Browser(1280, 800, scale=1.0 if options.drawn else 0.1) as browser:
         script = COUNT + ("" if options.drawn else NO_DRAWING)
         browser.call("Page.addScriptToEvaluateOnNewDocument", source=script)
         start = time.monotonic()
-        browser.go(told["address"])
-        wait_until(lambda: bool(told.last.get("places")), 120.0, "panels")
+        browser.go(page["address"])
+        wait_until(lambda: bool(page.last.get("places")), 120.0, "panels")
         print(f"panels sent after {time.monotonic() - start:.1f} s")
         if options.drawn:
             wait_until(lambda: browser.screenshot().std() > 15.0, 120.0, "picture")
             print(f"first picture after {time.monotonic() - start:.1f} s")
         time.sleep(5.0)
-        before, told_before, then = browser.evaluate("({...counted})"), dict(told.last), time.monotonic()
+        before, before_values, then = browser.evaluate("({...counted})"), dict(page.last), time.monotonic()
         time.sleep(options.seconds)
         after, elapsed = browser.evaluate("({...counted})"), time.monotonic() - then
         rate = {name: (after[name] - before[name]) / elapsed for name in before}
-        passed = {name: told[name] - told_before[name] for name in ("time", "robot_cpu_s", "page_cpu_s")}
+        passed = {name: page[name] - before_values[name] for name in ("time", "robot_cpu_s", "page_cpu_s")}
         print(f"robot: {passed['time'] / elapsed:.2f} s per s, over {elapsed:.0f} s")
         print(
             f"processor time of the robot: {passed['robot_cpu_s'] / passed['time']:.2f} s for each of its seconds; "

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import against_mjlab
-from benchmarks.against_mjlab import NEEDS, Side, compare, lacking, main, report
+from benchmarks.against_mjlab import NEEDS, Side, compare, main, missing_packages, report
 from go1exp.base.paths import data_root
 
 WORKER = """
@@ -81,14 +81,14 @@ def test_the_table_has_medians_and_ratios_of_rounds_side_by_side() -> None:
 
 
 def test_what_a_folder_lacks_is_named(tmp_path: Path) -> None:
-    assert lacking(tmp_path) == [f"{name} {wanted}".strip() for name, wanted in NEEDS.items()]
+    assert missing_packages(tmp_path) == [f"{name} {wanted}".strip() for name, wanted in NEEDS.items()]
     there = {"mjlab": "1.6.0", "rsl_rl_lib": "5.4.2", "mujoco": "4.0.0", "mujoco_warp": "3.11.2", "tensordict": "0.9"}
     for name, version in there.items():
         info = tmp_path / f"{name}-{version}.dist-info"
         info.mkdir()
         (info / "METADATA").write_text(f"Metadata-Version: 2.4\nName: {name}\nVersion: {version}\n")
-    assert lacking(tmp_path) == ["mujoco 3.11 (there is 4.0.0)"]
-    with pytest.raises(SystemExit, match=r"lacks mujoco 3\.11 \(there is 4\.0\.0\)[\s\S]*pip install --target"):
+    assert missing_packages(tmp_path) == ["mujoco 3.11 (there is 4.0.0)"]
+    with pytest.raises(SystemExit, match=r"misses mujoco 3\.11 \(there is 4\.0\.0\)[\s\S]*pip install --target"):
         main([f"site={tmp_path}"])
 
 

@@ -100,7 +100,7 @@ def folded(readings: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 def test_a_robot_that_stands_or_lies_misses_its_whole_command() -> None:
     robot_, commands = hidden.nominal(Ground()), ((0.5, 0.0, 0.0), (0.0, 0.0, 0.8))
     for policy, falls in ((held, False), (folded, True)):
-        errors, fell = hidden.judged(robot_, policy, commands, 2, 2.0, 0)
+        errors, fell = hidden.evaluated(robot_, policy, commands, 2, 2.0, 0)
         assert fell.tolist() == [falls] * 4
         np.testing.assert_allclose(errors, [0.5, 0.5, 0.8 * hidden.LEVER, 0.8 * hidden.LEVER], atol=0.01)
 
@@ -192,7 +192,7 @@ def test_falls_won_back_are_those_of_all_robots() -> None:
 
 def test_figures_and_tables_hold_what_the_rows_hold(tmp_path: Path) -> None:
     nominal = walks(0.1, 0)
-    verdict = {"logs": "hung", "verdict": "explained", "named": ["coulomb (certified)"]}
+    verdict = {"logs": "suspended", "verdict": "explained", "named": ["coulomb (certified)"]}
     each = [
         {"before": walks(0.3, 2), "plain": walks(0.25, 2), "net": walks(0.2, 1), "effects": walks(0.12, 0)},
         {"before": walks(0.5, 2), "plain": walks(0.5, 2), "net": walks(0.3, 1), "effects": walks(0.14, 1)},
@@ -323,26 +323,29 @@ def test_the_feet_are_asked_only_where_hung_logs_give_no_effect(
     def answering(*words: str, allowed: tuple[int, ...] = (0,)) -> int:
         given = dict(word.split("=", 1) for word in words[1:])
         asked.append(given["logs"])
-        hung = given["logs"].endswith("hung")
-        unsure = hung and "payload" in given["logs"]
+        suspended = given["logs"].endswith("suspended")
+        unsure = suspended and "payload" in given["logs"]
         status = "compensating" if unsure else "certified"
         Path(given["out"]).mkdir(parents=True)
-        answer = {"verdict": "explained", "named": [{"effect": "coulomb" if hung else "payload", "status": status}]}
+        answer = {
+            "verdict": "explained",
+            "named": [{"effect": "coulomb" if suspended else "payload", "status": status}],
+        }
         (Path(given["out"]) / "verdict.json").write_text(json.dumps(answer))
         return 10
 
     monkeypatch.setattr(commands, "run", answering)
     monkeypatch.setattr(closed_loop, "record", lambda place, name, folder: None)
     place = Place(tmp_path, SIZES["tiny"], seed=0, jobs=1, threads=1)
-    for name, support, named in (("friction", "hung", "coulomb"), ("payload", "ground", "payload")):
+    for name, support, named in (("friction", "suspended", "coulomb"), ("payload", "ground", "payload")):
         for _ in range(2):  # the second time from what was noted
             verdict = closed_loop.named_effects(place, name)
             assert verdict["logs"] == support
             assert verdict["named"] == [f"{named} (certified)"]
             assert verdict["file"] == str(tmp_path / name / f"gap_{support}" / "effect.yaml")
     assert [Path(logs).relative_to(tmp_path).as_posix() for logs in asked] == [
-        "friction/hung",
-        "payload/hung",
+        "friction/suspended",
+        "payload/suspended",
         "payload/ground",
     ]
 
@@ -363,15 +366,15 @@ def test_robots_come_in_order_however_many_are_worked_on(
         return step
 
     monkeypatch.setattr(closed_loop, "ProcessPoolExecutor", lambda n, *_: ThreadPoolExecutor(n))
-    for step in ("walker", "tuned", "judge_nominal"):
+    for step in ("walker", "tuned", "evaluate_nominal"):
         monkeypatch.setattr(closed_loop, step, noting(step))
-    monkeypatch.setattr(closed_loop, "hung", noting("hung", 0.05))
+    monkeypatch.setattr(closed_loop, "suspended", noting("suspended", 0.05))
     monkeypatch.setattr(closed_loop, "robot_of", noting("robot_of", 0.05))
     place = Place(tmp_path, SIZES["tiny"], seed=0, jobs=jobs, threads=1)
     assert list(closed_loop.in_turn(place, ["friction", "late"])) == ["friction", "late"]
     for name in ("friction", "late"):
         assert steps.index("walker") < steps.index("tuned") < steps.index(f"robot_of {name}")
-        assert jobs == 1 or steps.index(f"hung {name}") < steps.index(f"robot_of {name}")
+        assert jobs == 1 or steps.index(f"suspended {name}") < steps.index(f"robot_of {name}")
     if jobs == 2:  # the quicker one does not wait
         assert steps.index("robot_of late") < steps.index("robot_of friction")
 

@@ -487,13 +487,13 @@ def test_a_simulated_go1_that_squats_is_followed(source: Literal["force", "torqu
 
 
 def test_on_the_real_scaler_it_beats_leg_odometry_by_far() -> None:
-    from benchmarks.mocap import judge
+    from benchmarks.mocap import evaluate
 
     root = Path(os.environ.get("GO1EXP_DATA", data_root().parent / "shared/data"))
     if not (root / "scaler_walk_mocap").is_dir():
         pytest.skip(f"no scaler_walk_mocap in {root}; set GO1EXP_DATA")
     for run in (15, 23):
-        states = judge(root / f"scaler_walk_mocap/run_{run}.npz", scaler())
+        states = evaluate(root / f"scaler_walk_mocap/run_{run}.npz", scaler())
         assert states.filter_rmse < 0.09, states
         assert states.filter_rmse < 0.7 * states.odometry_rmse, states
         assert abs(states.filter_distance) < 0.6 * abs(states.odometry_distance), states

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.mocap import judge
+from benchmarks.mocap import evaluate
 from go1exp.base.paths import data_root
 from go1exp.deploy.estimation import go1, make_filter, readings, scaler
 from go1exp.logs.importers import import_recordings
@@ -84,14 +84,14 @@ def test_it_is_what_the_feet_carry() -> None:
 @pytest.mark.parametrize("number", [14, 15])
 def test_motion_capture_a_stride_off_is_moved_back(number: int, tmp_path: Path) -> None:
     """Run 14 came so; run 15 is made so."""
-    right = judge(DATA / "run_15.npz", scaler()) if run(15) else None
+    right = evaluate(DATA / "run_15.npz", scaler()) if run(15) else None
     assert right is not None
     assert right.clock_shift == 0.0
     arrays = run(number)
     if number == 15:
         arrays["mocap_t"] = arrays["mocap_t"] - 0.51
     path = saved(tmp_path, arrays)
-    result = judge(path, scaler())
+    result = evaluate(path, scaler())
     assert result.clock_shift == pytest.approx(0.51, abs=0.03)
     assert result.truth_distance == pytest.approx(right.truth_distance, rel=0.02)  # the same walk
     (r,) = import_recordings("scaler_walk_mocap", path, {})
@@ -105,7 +105,7 @@ def test_motion_capture_a_stride_off_is_moved_back(number: int, tmp_path: Path) 
 
 @pytest.mark.slow("go1exp/deploy/estimation/", "go1exp/evaluate/agents.py", "assets/estimation/", "hatch_build.py")
 def test_broken_rows_and_missing_sensors_do_not_stop_a_run(tmp_path: Path) -> None:
-    whole = judge(DATA / "run_19.npz", scaler()) if run(19) else None
+    whole = evaluate(DATA / "run_19.npz", scaler()) if run(19) else None
     arrays = run(19)
     del arrays["foot_wrench_raw"], arrays["mocap_valid"]
     arrays["accel_body"][300] = np.nan
@@ -116,7 +116,7 @@ def test_broken_rows_and_missing_sensors_do_not_stop_a_run(tmp_path: Path) -> No
     (r,) = import_recordings("scaler_walk_mocap", path, {})
     assert len(r.t) == len(arrays["t"]) - 3
     assert "3 rows were not finite or not newer" in r.meta.notes
-    result = judge(path, scaler())
+    result = evaluate(path, scaler())
     assert whole is not None
     assert result.filter_rmse == pytest.approx(whole.filter_rmse, abs=0.01)
     assert result.filter_distance == pytest.approx(whole.filter_distance, abs=0.02)

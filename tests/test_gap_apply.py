@@ -342,15 +342,15 @@ def test_the_right_effect_is_proved_and_a_wrong_one_is_not(tmp_path: Path) -> No
 def test_what_is_proved_is_compared_on_the_windows_on_which_it_was_reported(tmp_path: Path) -> None:
     """Another split has other windows, whose error may be twice as large: what holds would be refused (exit 15)."""
     small = named("coulomb", half=0.01, bound={j: 0.5 * v for j, v in HIDDEN.items()})
-    alone = [proof(tmp_path, result(small, provenance={"windows": 8, "judged": [k]})) for k in (0, 7)]
+    alone = [proof(tmp_path, result(small, provenance={"windows": 8, "evaluated": [k]})) for k in (0, 7)]
     assert alone[0].after != alone[1].after
     for k, one in zip((0, 7), alone, strict=True):
-        told = result(small, excess={"final": 0.0, "written": one.after}, provenance={"windows": 8, "judged": [k]})
+        told = result(small, excess={"final": 0.0, "written": one.after}, provenance={"windows": 8, "evaluated": [k]})
         again = proof(tmp_path, told)
         assert again.holds
         assert again.reported == again.after == one.after
     with pytest.raises(files.GapFileError, match="8 windows, 13 in the search that found this"):
-        proof(tmp_path, result(small, provenance={"windows": 13, "judged": [0]}))
+        proof(tmp_path, result(small, provenance={"windows": 13, "evaluated": [0]}))
 
 
 def test_a_calibration_counts_with_the_effect_and_not_alone(tmp_path: Path) -> None:

@@ -14,7 +14,12 @@ from go1exp.logs.recording import read_folder
 
 SEED = 20261121
 
-SLICE = (("null", 1), ("single", 2 * len(cases.HUNG) + cases.HUNG.index("lag")), ("outside", 0), ("damaged", 2))
+SLICE = (
+    ("null", 1),
+    ("single", 2 * len(cases.SUSPENDED) + cases.SUSPENDED.index("lag")),
+    ("outside", 0),
+    ("damaged", 2),
+)
 """Kind and index: a background within tolerances, lag at 5 tolerances, one beyond the library, lost samples."""
 
 
@@ -31,7 +36,7 @@ def test_a_sealed_case(kind: str, index: int, tmp_path: Path) -> None:
     generate.write_case(case, out=tmp_path / "cases")
     solve(tmp_path / "cases" / case.name, tmp_path / "out", {})
     results = score.read_results(tmp_path / "out")
-    found = score.judge({case.name: case.answer}, results)
+    found = score.evaluate({case.name: case.answer}, results)
     failures = {name: lines for name, lines in found.failures.items() if lines}
     if kind == "single":
         assert found.figures["first_exact"][0] == found.figures["in_set"][0] == 1.0, failures

@@ -232,7 +232,7 @@ def test_a_command_delay_shifts_the_answer_in_time() -> None:
 
 
 @pytest.mark.slow("benchmarks/", "go1exp/sim/effects/")
-@pytest.mark.parametrize("effect", cases.HUNG)
+@pytest.mark.parametrize("effect", cases.SUSPENDED)
 @pytest.mark.usefixtures("brief")
 def test_every_effect_moves_the_robot(effect: str) -> None:
     rng = np.random.default_rng(2)
@@ -286,8 +286,8 @@ def test_a_seed_fixes_a_case_bit_for_bit(kind: str) -> None:
 
 
 def test_the_case_does_not_depend_on_the_others_and_sizes_go_round() -> None:
-    drawn = [cases.make("single", i, 3, 2, 0.1).answer["effects"][0] for i in range(3 * len(cases.HUNG))]
-    assert {(e["effect"], e["size"]) for e in drawn} == {(e, s) for e in cases.HUNG for s in cases.SIZES}
+    drawn = [cases.make("single", i, 3, 2, 0.1).answer["effects"][0] for i in range(3 * len(cases.SUSPENDED))]
+    assert {(e["effect"], e["size"]) for e in drawn} == {(e, s) for e in cases.SUSPENDED for s in cases.SIZES}
     for e in drawn:
         for name in e["sizes"]:
             away = np.abs(np.asarray(e["drawn"][name]) - known.null(e["effect"], name))
@@ -436,7 +436,7 @@ def test_wrong_settings_are_refused(words: list[str], message: str) -> None:
 
 
 def test_the_answer_is_the_robot_and_not_only_what_was_added() -> None:
-    case = cases.make("single", cases.HUNG.index("armature"), 5, 2, 0.2)
+    case = cases.make("single", cases.SUSPENDED.index("armature"), 5, 2, 0.2)
     (effect,) = case.answer["effects"]
     at = [robot.JOINTS.index(j) for j in effect["joints"]]
     nominal = np.tile(known.NOMINAL["armature"], 4)

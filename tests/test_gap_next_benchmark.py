@@ -1,10 +1,10 @@
-"""``benchmarks/gap_next.py``: what is counted of recordings until a pair is told apart."""
+"""``benchmarks/gap_next.py``: what is counted of recordings until a pair is separated."""
 
 from __future__ import annotations
 
 import pytest
 
-from benchmarks.gap_next import CASES, TOLD_APART, Row, figures, line_of, main, ratios
+from benchmarks.gap_next import CASES, SEPARATED, Row, figures, line_of, main, ratios
 from go1exp.config.schema.registry import members
 from go1exp.gap.search.tolerances import confounded
 
@@ -12,7 +12,7 @@ MOST = 4
 
 
 def row(strategy: str, seconds: float | None, seed: int = 0, **searched: object) -> Row:
-    ended = "called not separable" if seconds is None else TOLD_APART
+    ended = "called not separable" if seconds is None else SEPARATED
     about = {"truth": "viscous", "rival": "kd_scale", "strategy": strategy, "seed": seed, "ended": ended}
     return about | {"seconds": seconds or 0.0, "powers": [0.1, 0.9]} | searched
 
@@ -23,7 +23,7 @@ def test_a_ratio_needs_one_of_the_two_to_tell_the_pair_apart() -> None:
     assert ratios([row("next", None), row("standard", 12.0)], MOST, 6.0) == [2.5]
     assert ratios([row("next", None), row("standard", None)], MOST, 6.0) == []
     assert ratios([row("next", 6.0), row("standard", 24.0, seed=1)], MOST, 6.0) == []
-    at_hand = {"ended": TOLD_APART, "seconds": 0.0}
+    at_hand = {"ended": SEPARATED, "seconds": 0.0}
     assert ratios([row("next", None) | at_hand, row("standard", None) | at_hand], MOST, 6.0) == []
 
 
@@ -43,7 +43,7 @@ def test_searches_count_where_one_name_is_left_and_where_a_certified_one_is_wron
     flat = figures([right, several, wrong], MOST, 6.0)
     assert (flat["next_one_name"], flat["next_false_names"], flat["next_searches"]) == (1, 1, 3)
     assert "next_over_standard" not in flat
-    assert line_of(right).endswith("10% 90% (told apart; explained, viscous (certified))")
+    assert line_of(right).endswith("10% 90% (separated; explained, viscous (certified))")
 
 
 def test_pairs_are_of_registered_effects_that_look_alike() -> None:

@@ -67,7 +67,7 @@ def test_single_effects() -> None:
         "unnamed": {**result("unexplained"), "candidates": [{"effect": "cogging"}, {"effect": "coulomb"}]},
         "small": result("no gap"),
     }
-    found = score.judge(answers, results)
+    found = score.evaluate(answers, results)
     assert value(found, "first") == pytest.approx(3 / 5)  # right, alias, and ranked first though not named
     assert value(found, "first_exact") == pytest.approx(2 / 5)
     assert value(found, "in_set") == pytest.approx(2 / 5)
@@ -92,13 +92,13 @@ def test_visible_effects_are_counted_apart() -> None:
         "seen": answer("single", effect("coulomb", bound=0.2), signal=4.0),
         "hidden": answer("single", effect("base_tilt", 2.0, [], roll=0.02), signal=0.4),
     }
-    found = score.judge(answers, {"seen": result("explained", named("coulomb")), "hidden": result("no gap")})
+    found = score.evaluate(answers, {"seen": result("explained", named("coulomb")), "hidden": result("no gap")})
     assert (value(found, "first"), value(found, "first_visible")) == (0.5, 1.0)
 
 
 def test_effects_that_the_tolerances_make_up_for_are_counted_apart() -> None:
     answers = {name: answer("single", effect("coulomb", bound=0.2)) for name in ("gap", "missed", "made_up", "silent")}
-    found = score.judge(
+    found = score.evaluate(
         answers,
         {
             "gap": {**result("explained", named("coulomb")), "excess": {"box": 3.0}},
@@ -124,11 +124,11 @@ def test_null_cases() -> None:
         "compensating": result("partly explained", named("lag", status="compensating")),
         "background": result("explained", named("base_tilt")),  # in the family of what is really there
     }
-    found = score.judge(answers, results)
+    found = score.evaluate(answers, results)
     assert (value(found, "false_names"), value(found, "nulls")) == (2.0, 4.0)
     assert found.figures["false_name_rate"][0] == 0.5
     near = {"right": answer("near_null", beyond="viscous"), "wrong": answer("near_null", beyond="viscous")}
-    found = score.judge(
+    found = score.evaluate(
         answers | near,
         results | {"right": result("explained", named("kd_scale")), "wrong": result("explained", named("coulomb"))},
     )
@@ -147,7 +147,7 @@ def test_joints_are_right_if_they_are_all_and_no_others() -> None:
         "less": result("explained", named("coulomb", joints=at[:1])),
         "other": result("explained", named("stribeck", joints=at)),  # counted by ``first``
     }
-    assert score.judge(answers, results).figures["joints_exact"][::3] == (1 / 3, 3)
+    assert score.evaluate(answers, results).figures["joints_exact"][::3] == (1 / 3, 3)
 
 
 def test_effects_beyond_the_library() -> None:
@@ -158,7 +158,7 @@ def test_effects_beyond_the_library() -> None:
         "named": result("unexplained", named("coulomb")),
         "explained": result("explained", named("coulomb")),
     }
-    found = score.judge(answers, results)
+    found = score.evaluate(answers, results)
     assert value(found, "outside_handled") == pytest.approx(2 / 5)
     assert value(found, "wrong_explained") == pytest.approx(1 / 5)
 
@@ -172,7 +172,7 @@ def test_pairs() -> None:
         "one": result("partly explained", named("coulomb"), compensating),
         "worse": result("explained", named("coulomb"), named("payload")),
     }
-    found = score.judge(answers, results)
+    found = score.evaluate(answers, results)
     assert value(found, "pairs_both") == pytest.approx(1 / 3)
     assert value(found, "pair_precision") == pytest.approx(4 / 5)
 
@@ -180,9 +180,9 @@ def test_pairs() -> None:
 def test_friction_of_two_directions_is_its_mean_and_a_constant() -> None:
     answers = {"a": answer("single", effect("asymmetric_friction", forward=[0.2, 0.2], backward=[0.0, 0.0]))}
     both = result("explained", named("coulomb"), named("encoder_offset"))
-    found = score.judge(answers, {"a": both})
+    found = score.evaluate(answers, {"a": both})
     assert (value(found, "first"), value(found, "in_set"), value(found, "first_exact")) == (1.0, 1.0, 0.0)
-    found = score.judge(answers, {"a": result("explained", named("coulomb"))})
+    found = score.evaluate(answers, {"a": result("explained", named("coulomb"))})
     assert (value(found, "first"), value(found, "in_set")) == (1.0, 0.0)
 
 
@@ -202,7 +202,7 @@ def test_silent_and_damaged_logs() -> None:
         "passed": result("no gap"),
         "null": result("bad log"),
     }
-    found = score.judge(answers, results)
+    found = score.evaluate(answers, results)
     assert value(found, "not_excited_unnamed") == value(found, "not_excited_said") == 0.5
     assert value(found, "damaged_caught") == 0.5
     assert value(found, "bad_log_only_if_bad") == pytest.approx(2 / 3)
@@ -217,16 +217,16 @@ def test_numbers_and_lists_are_parameters_too() -> None:
         "tilt": result("explained", named("base_tilt", joints=[], **tilt)),
         "scale": result("explained", named("strength", **scale)),
     }
-    found = score.judge(answers, results)
+    found = score.evaluate(answers, results)
     assert found.figures["param_error"] == pytest.approx((0.1, 0.05, 0.25, 3), abs=0.06)  # 5 %, 10 %, 25 %
     assert value(found, "coverage") == pytest.approx(2 / 3)
 
 
 def test_nonsense_is_refused() -> None:
     with pytest.raises(ValueError, match="b: no such case"):
-        score.judge({"a": answer("null")}, {"b": result("no gap")})
+        score.evaluate({"a": answer("null")}, {"b": result("no gap")})
     with pytest.raises(ValueError, match="a: verdict 'fine'"):
-        score.judge({"a": answer("null")}, {"a": result("fine")})
+        score.evaluate({"a": answer("null")}, {"a": result("fine")})
 
 
 def test_the_command_checks_the_seal_and_writes_flat_results(

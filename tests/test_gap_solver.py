@@ -326,7 +326,7 @@ def test_where_little_is_left_and_nothing_alone_removes_it_what_strains_a_tolera
 ) -> None:
     judged, model = [], Model("base_tilt", {}, Freedom(DECLARED, frozenset()), ())
 
-    def judge(
+    def evaluate(
         search: Search, fitted: list[str], state: Any, train: Any, select: Any, small: bool
     ) -> tuple[Search, Model | None, None]:
         judged.append((*fitted, small))
@@ -335,7 +335,7 @@ def test_where_little_is_left_and_nothing_alone_removes_it_what_strains_a_tolera
     monkeypatch.setattr(stepwise, "screened_by", lambda search: [])
     monkeypatch.setattr(stepwise, "fitted_candidates", lambda search, screened: ["screened"])
     monkeypatch.setattr(stepwise, "at_active_bounds", lambda search, screened: (search, ["leaning"]))
-    monkeypatch.setattr(stepwise, "held_out_test", judge)
+    monkeypatch.setattr(stepwise, "held_out_test", evaluate)
     monkeypatch.setattr(stepwise, "accept", lambda search, accepted: (search, accepted is model))
     state: Any = SimpleNamespace(terms=(), relaxed=(), train_chi2=None, settings=GapSettings())
     chi2 = np.full((8, 4), 1.0 + left)

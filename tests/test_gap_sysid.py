@@ -79,7 +79,7 @@ def test_a_large_armature_is_found_and_the_verdict_can_be_scored(tmp_path: Path)
     assert verdict["named"][0]["joints"] == ["FL_thigh"]
     assert verdict["named"][0]["params"]["added"]["FL_thigh"] == pytest.approx(0.005, rel=0.1)
     assert {c["effect"] for c in verdict["candidates"]} == set(gap_sysid.FITTED) <= set(known.LIBRARY)
-    found = score.judge({case.name: case.answer}, score.read_results(tmp_path / "out"))
+    found = score.evaluate({case.name: case.answer}, score.read_results(tmp_path / "out"))
     assert found.figures["first_exact"][0] == 1.0, found.failures
 
 

@@ -52,7 +52,7 @@ def answer(**changes: Any) -> GapResult:
         "armature", (JOINT,), {"added": {JOINT: 0.004}}, {"added": {JOINT: (0.003, 0.005)}}, ("armature",), "certified"
     )
     usual: dict[str, Any] = {"named": (named,), "box": {"armature": {"added": {"FR_hip": 0.0006}}}}
-    return GapResult("explained", "The model lacks rotor inertia.", **{**usual, **changes})
+    return GapResult("explained", "The model is missing rotor inertia.", **{**usual, **changes})
 
 
 # ---------------------------------------------------------------------- what counts

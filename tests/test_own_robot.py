@@ -133,7 +133,7 @@ def test_the_page_is_followed_to_the_hidden_friction(
     assert [n["effect"] for n in verdict["named"]] == ["coulomb"]
     assert verdict["named"][0]["joints"] == ["elbow"]
     assert verdict["named"][0]["params"]["bound"]["elbow"] == pytest.approx(HIDDEN, abs=0.01)
-    (shown,) = re.findall(r"^> (The model lacks dry friction .*: bound 0.15)", TEXT, re.MULTILINE)
+    (shown,) = re.findall(r"^> (The model is missing dry friction .*: bound 0.15)", TEXT, re.MULTILINE)
     assert verdict["sentence"].startswith(shown)
     assert Path("gap/report.html").is_file()
     assert "coulomb" in Path("gap/effect.yaml").read_text()

@@ -355,7 +355,7 @@ def answer(joints: tuple[str, ...] = robot.JOINTS) -> GapResult:
         measured |= {f"qd_{joint}": 0.1 * np.cos(t + k) for k, joint in enumerate(joints)}
         before, after = ({name: v + off for name, v in measured.items()} for off in (4e-3, 1e-3))
         windows.append(Overlay(episode, t, measured, before, after, dict.fromkeys(measured, 3e-4)))
-    return GapResult("explained", "The model lacks dry friction.", overlays=tuple(windows))
+    return GapResult("explained", "The model is missing dry friction.", overlays=tuple(windows))
 
 
 def test_an_answer_is_shown_window_by_window() -> None:

@@ -46,7 +46,7 @@ DAMAGES = (
     *("swapped_joints", "flipped_sign", "dropped", "shifted_commands", "degrees", "truncated", "frozen", "repeated"),
 )
 
-HUNG = tuple(e for e in known.LIBRARY if e not in (*known.GROUND_ONLY, *known.NEVER_HIDDEN))
+SUSPENDED = tuple(e for e in known.LIBRARY if e not in (*known.GROUND_ONLY, *known.NEVER_HIDDEN))
 """Effects that a suspended robot feels."""
 
 Values = dict[str, np.ndarray | float]
@@ -239,7 +239,7 @@ def make(
     name = "case_" + hashlib.sha256(f"{seed} {kind} {index}".encode()).hexdigest()[:12]
     truth, damage, on = Truth(), None, np.zeros(12, dtype=bool)
     motions: tuple[str, ...] = EVERYTHING
-    names = tuple(only) or HUNG
+    names = tuple(only) or SUSPENDED
     effects: list[dict[str, Any]] = []
     clean = kind == "null" and index % 4 == 0
     beyond = str(rng.choice(BEYOND)) if not clean and kind != "damaged" and rng.random() < OUTSIDE_SHARE else None

@@ -1,4 +1,4 @@
-"""The robots that ``benchmarks/closed_loop.py`` hides, and their recordings: hung, and on their feet.
+"""The robots that ``benchmarks/closed_loop.py`` hides, and their recordings: suspended, and standing.
 
 Every one is also a little wrong everywhere, within the tolerances (``cases.background``).
 """
@@ -21,10 +21,10 @@ from go1exp import robot
 from go1exp.logs.recording import Recording
 
 HUNG_DT, WALK_DT = 2.5e-4, 5e-4
-"""Steps of the physics of hung and of walking robots, s; an error at half of the latter is the same within 1 %."""
+"""Steps of the physics of suspended and of walking robots, s; an error at half of the latter is the same within 1 %."""
 
 HUNG_GAINS = ((KP, KD), (35.0, 1.2), (KP, KD), (35.0, 0.6))
-"""Of hung robots, one recording after the other."""
+"""Of suspended robots, one recording after the other."""
 
 FOR_NETS = ("chirp", "steps", "gait", "chirp", "steps", "gait", "ramps")
 """Motions of the recordings for a net, the drives always on."""
@@ -161,7 +161,7 @@ def record_ground(
     ]
 
 
-def judged(
+def evaluated(
     hidden: Hidden, policy: Policy, commands: Sequence[tuple[float, float, float]], n: int, seconds: float, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the tracking error (C n,) of ``n`` walks with each of C commands, m/s, and whether the robot fell.

@@ -62,7 +62,7 @@ GROUND_ONLY = ("com_offset", "external_wrench", "foot_friction", "ground_complia
 
 NEVER_HIDDEN = ("fixed_point", "soft_mount")
 """Effects that no case hides: on logs at one gain the first is ``kp_scale`` and ``viscous`` to the last bit, and the
-benchmark's robots hang bolted."""
+benchmark's robots are suspended, fixed-base."""
 
 ALIASES: tuple[frozenset[str], ...] = (
     frozenset({"kd_scale", "viscous"}),

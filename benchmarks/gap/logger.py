@@ -89,25 +89,25 @@ def log(
 def meta(episode: Episode) -> Meta:
     """Describe an episode as a real robot's logger would; nothing in it tells what the robot hides."""
     w, x, y, z = attitude(episode.hang).as_quat(scalar_first=True)
-    hung = (float(w), float(x), float(y), float(z))
-    return described(episode.name, episode.excitation, (episode.kp, episode.kd), hung, episode.repeat_of)
+    base_quat = (float(w), float(x), float(y), float(z))
+    return described(episode.name, episode.excitation, (episode.kp, episode.kd), base_quat, episode.repeat_of)
 
 
 def described(
     name: str,
     excitation: str,
     gains: tuple[float, float],
-    hung: tuple[float, float, float, float] | None,
+    base_quat: tuple[float, float, float, float] | None,
     repeat_of: str | None = None,
 ) -> Meta:
-    """Describe a recording at gains kp and kd, N m/rad and N m s/rad; ``hung`` is the attitude of a held trunk."""
+    """Describe a recording at gains kp and kd, N m/rad and N m s/rad; ``base_quat`` is the attitude of a held trunk."""
     kp, kd = gains
     return Meta(
         robot="go1",
         joints=robot.JOINTS,
         rate_hz=RATE,
-        base="floating" if hung is None else "fixed",
-        base_quat=hung,
+        base="floating" if base_quat is None else "fixed",
+        base_quat=base_quat,
         kp=(kp,) * robot.NUM_JOINTS,
         kd=(kd,) * robot.NUM_JOINTS,
         tau_limit=tuple(float(v) for v in robot.per_joint(robot.EFFORT_LIMIT)),

@@ -68,7 +68,7 @@ BARS = {
 
 
 @dataclass
-class Judged:
+class Solved:
     """One case, its answer and its result (None if there is none)."""
 
     name: str
@@ -139,14 +139,14 @@ class Score:
     failures: dict[str, list[str]] = field(default_factory=dict)
     confusion: Counter[tuple[str, str]] = field(default_factory=Counter)
 
-    def rate(self, name: str, cases: Iterable[tuple[Judged, bool]]) -> None:
+    def rate(self, name: str, cases: Iterable[tuple[Solved, bool]]) -> None:
         """Enter a share; the cases for which it fails are listed."""
         outcomes = list(cases)
         self.figures[name] = share([good for _, good in outcomes])
         self.failures[name] = [_line(case) for case, good in outcomes if not good]
 
 
-def _line(case: Judged) -> str:
+def _line(case: Solved) -> str:
     truth = " + ".join(f"{e['effect']} x{e['size']:g} on {_where(e['joints'])}" for e in case.answer["effects"])
     truth = truth or case.answer.get("outside", {}).get("effect") or case.answer.get("damage") or "nothing"
     beyond = f" (background: {case.answer['background_beyond']})" if case.answer.get("background_beyond") else ""
@@ -157,7 +157,7 @@ def _where(joints: Sequence[str]) -> str:
     return "the robot" if not joints else joints[0] if len(joints) == 1 else f"{len(joints)} joints"
 
 
-def judge(answers: dict[str, Any], results: dict[str, dict[str, Any]]) -> Score:
+def evaluate(answers: dict[str, Any], results: dict[str, dict[str, Any]]) -> Score:
     """Compare results with answers, both by case.
 
     Raises:
@@ -167,9 +167,9 @@ def judge(answers: dict[str, Any], results: dict[str, dict[str, Any]]) -> Score:
     strange += [f"{k}: no such case" for k in results if k not in answers]
     if strange:
         raise ValueError("; ".join(strange))
-    cases = [Judged(name, answer, results.get(name)) for name, answer in sorted(answers.items())]
+    cases = [Solved(name, answer, results.get(name)) for name, answer in sorted(answers.items())]
 
-    def of(kind: str) -> list[Judged]:
+    def of(kind: str) -> list[Solved]:
         return [c for c in cases if c.kind == kind]
 
     score, singles = Score(), [c for c in of("single") if c.answer["effects"][0]["size"] >= LOWEST]
@@ -225,44 +225,44 @@ def judge(answers: dict[str, Any], results: dict[str, dict[str, Any]]) -> Score:
     return score
 
 
-def _seconds(cases: Iterable[Judged]) -> list[float]:
+def _seconds(cases: Iterable[Solved]) -> list[float]:
     """Return the wall time of every case that has one, s."""
     return [float(c.result["seconds"]) for c in cases if c.result and c.result.get("seconds") is not None]
 
 
-def _misses(score: Score, name: str, cases: list[tuple[Judged, bool]]) -> None:
+def _misses(score: Score, name: str, cases: list[tuple[Solved, bool]]) -> None:
     """Enter the share of cases in which something bad happened, and list them."""
     score.figures[name] = share([bad for _, bad in cases])
     score.failures[name] = [_line(case) for case, bad in cases if bad]
 
 
-def _within(case: Judged) -> float:
+def _within(case: Solved) -> float:
     """Return the held-out excess of the model within its tolerances; -inf where a result does not say."""
     return float(((case.result or {}).get("excess") or {}).get("box", -math.inf))
 
 
-def _sets(case: Judged) -> set[str]:
+def _sets(case: Solved) -> set[str]:
     return {name for n in case.named for name in (n["effect"], *n.get("alias_set", []))}
 
 
-def _equivalent(case: Judged) -> bool:
+def _equivalent(case: Solved) -> bool:
     """Whether a set was named that describes the hidden effect exactly."""
     return any(known.EQUIVALENT.get(n, frozenset({"-"})) <= _sets(case) for n in case.true)
 
 
-def _right_joints(case: Judged) -> list[bool]:
+def _right_joints(case: Solved) -> list[bool]:
     """Return whether the hidden effect of joints, where it is named, is named at its joints and at no others."""
     (true,) = case.answer["effects"]
     named = [n for n in case.named if n["effect"] == true["effect"]]
     return [set(n["joints"]) == set(true["joints"]) for n in named if true["joints"]]
 
 
-def _recovered(case: Judged, true: str) -> bool:
+def _recovered(case: Solved, true: str) -> bool:
     names = {n["effect"] for n in case.named}
     return bool(names & known.family(true)) or bool(names & known.EQUIVALENT.get(true, frozenset()))
 
 
-def _parameters(cases: Iterable[Judged]) -> tuple[list[float], list[bool]]:
+def _parameters(cases: Iterable[Solved]) -> tuple[list[float], list[bool]]:
     """Compare what was estimated for effects that were named rightly: one relative error per parameter and case.
 
     An error is |estimate - truth| / |truth - null|, its median over the joints of the effect; coverage counts joints.
@@ -368,7 +368,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     results = read_results(Path(given["results"]))
     if given.get("solved") == "true":  # cases are solved in the order of names, which say nothing about them
         answers = {name: answer for name, answer in answers.items() if name in results}
-    score = judge(answers, results)
+    score = evaluate(answers, results)
     print(table(score))
     if "out" in given:
         Path(given["out"]).write_text(json.dumps(flat(score), indent=1) + "\n")

@@ -1,4 +1,4 @@
-"""The hidden robot on its feet: the drives of ``simulate.py``, a free trunk, flat ground; by a policy or by targets.
+"""The hidden robot standing: the drives of ``simulate.py``, a free trunk, flat ground; by a policy or by targets.
 
 MuJoCo moves the links and computes the contacts of the feet; friction, drives and gears are the generator's own.
 """
@@ -31,7 +31,7 @@ SETTLE = 0.6
 """Time for which a robot stands before its log begins, s."""
 
 FALLEN = (0.14, 1.0)
-"""A robot whose trunk is lower than this, m, or leans by more, rad, has fallen."""
+"""A robot whose trunk is lower than this, m, or tilts by more, rad, has fallen."""
 
 LOAD_AT = (0.0, 0.0, 0.1)
 """Where the payload sits, m from the trunk's origin: on top."""
@@ -116,7 +116,7 @@ def build(truth: Truth, ground: Ground, dt: float) -> mujoco.MjModel:
 
 
 class _Robots:
-    """N robots that stand, and then do what they are told."""
+    """N robots that stand, and then follow commands."""
 
     def __init__(
         self,
@@ -257,7 +257,7 @@ def _rows(tape: Sequence[tuple[np.ndarray, ...]]) -> Rows:
 
 
 def squat(t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return targets (T, J), rad: the trunk goes down and up, each leg a little on its own, so that it also leans."""
+    """Return targets (T, J), rad: the trunk goes down and up, each leg a little differently, so that it also tilts."""
     bend = np.array([0.0, 0.5, -1.0])  # a foot stays below its hip
     hz = rng.uniform(0.5, 1.3, 2)
     depth = 0.35 * (1.0 - np.cos(2 * np.pi * hz[0] * t)) * rng.uniform(0.7, 1.0)

@@ -73,7 +73,7 @@ def _of_group(membership: Path, root: Path = Path("/sys/fs/cgroup")) -> int | No
 
 
 def _left_in(folder: Path, limit: str, statistics: str, used: str) -> list[int]:
-    """Return a group's limit less what its processes use (the disk's cache gives way); empty if unlimited."""
+    """Return a group's limit less what its processes use (the disk's cache does not count); empty if unlimited."""
     try:
         most = int((folder / limit).read_text())
         figures = dict(line.split() for line in (folder / statistics).read_text().splitlines())

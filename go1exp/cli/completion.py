@@ -50,7 +50,7 @@ WORDS = {
     "target": ("tau_est", "joint_torque"),
     "device": ("auto", "cpu", "cuda"),
     "start": ("standing", "lying", "suspended"),
-    "judge": ("max_t", "gain", "bic"),
+    "selection": ("max_t", "gain", "bic"),
     "correction": ("holm", "none"),
     "wandb": ("offline", "online"),
     "schedule": ("adaptive", "fixed", "linear"),

@@ -86,7 +86,7 @@ class GapSettings:
         torque: also score the torque that the drives report, where it was logged.
         calibrate: whether nominal parameters may move within their tolerances first; without, small errors of the model
             are taken for effects (for comparison).
-        judge: how candidates are tested: ``max_t`` on held-out windows; for comparison ``gain``, any gain there, or
+        selection: how candidates are tested: ``max_t`` on held-out windows; for comparison ``gain``, any gain there, or
             ``bic``, Schwarz's criterion on the windows of the fit.
         alpha: significance that a term needs; ten times that if it removes three quarters of a gap.
         min_share: share of the remaining excess that a term must remove.
@@ -117,7 +117,7 @@ class GapSettings:
     phase: Phase = "auto"
     torque: bool = False
     calibrate: bool = True
-    judge: Literal["max_t", "gain", "bic"] = "max_t"
+    selection: Literal["max_t", "gain", "bic"] = "max_t"
     alpha: Share = 0.01
     min_share: Fraction = 0.1
     max_terms: Count = 4
@@ -331,7 +331,7 @@ class GapResult:
         floors: None if the log is bad.
         excess: held-out excess of the plain model (``null``), within its tolerances (``box``), with what was named
             (``final``), that on windows kept for the last check (``confirm``), and that of what the written files
-            hold, on the windows whose numbers are ``judged`` in the provenance (``written``).
+            hold, on the windows whose numbers are ``evaluated`` in the provenance (``written``).
         closed: share of the held-out excess that the named effects removed; NaN without one.
         errors: of the angles, in rad, before and after; None if the log is bad.
         before: localisation of the plain model; None if the log is bad.

@@ -129,4 +129,4 @@ def _effect_sentence(effect: NamedEffect, everyone: Sequence[str], known: Tolera
     at = f" at {where(effect.joints, everyone)}" if effect.joints else ""
     doubted = "" if effect.status == "certified" else f" (compensating, not certified: {effect.reason})"
     title = f"{effect_class(effect.effect).title} ({effect.effect})"
-    return f"The model lacks {title}{at}: {'; '.join(texts)}{doubted}."
+    return f"The model is missing {title}{at}: {'; '.join(texts)}{doubted}."

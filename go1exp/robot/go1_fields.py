@@ -116,7 +116,12 @@ def dtype_of(fields: tuple[Field, ...], **parts: tuple[np.dtype[Any], tuple[int,
 
 COMMAND = (
     *_BEGIN,
-    Field("motor", "V27", "MOTOR_COMMAND, 20 of them: FR FL RR RL x hip thigh calf, then 8 that a Go1 lacks", TRIED),
+    Field(
+        "motor",
+        "V27",
+        "MOTOR_COMMAND, 20 of them: FR FL RR RL x hip thigh calf, then 8 unused",
+        TRIED,
+    ),
     Field("battery_off", "(4,)u1", "0xA5 in the first byte switches the battery off; the rest is reserve", SDK),
     *_END,
     *_CRC,

@@ -58,7 +58,7 @@ def parse(settings: Any, parts: Mapping[str, Any]) -> tuple[dict[str, Ramp], lis
 
 
 def _left_out(ramp: Ramp, parts: Mapping[str, Any]) -> bool:
-    """Return whether a ramp is optional and the task lacks its setting, or sets it for each robot."""
+    """Return whether a ramp is optional and the task has no such setting, or sets it for each robot."""
     taken = ramp.path == CONTACT_TIME and _contact_problems("", parts)
     return ramp.optional and (ramp.path not in changeable(parts) or bool(taken))
 

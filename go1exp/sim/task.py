@@ -90,7 +90,7 @@ class ActionConfig:
 
 @dataclass(frozen=True)
 class TaskConfig:
-    """One environment: everything that shapes what a policy sees, does and is paid for.
+    """One environment: everything that shapes what a policy sees, does and is rewarded for.
 
     ``critic`` is what the value function sees beside the policy's observation, in training alone.
     """
@@ -221,7 +221,7 @@ SECTIONS: dict[str, type] = {
 """Sections of the configuration that are one dataclass each (of the backend, one for each engine)."""
 
 ENGINES = ("backend", "engine")
-"""Groups of which a configuration uses one engine: the one that trains, and the one that judges."""
+"""Groups of which a configuration uses one engine: the one that trains, and the one that evaluates."""
 
 OF_OLDER_RUNS: dict[str, Any] = {"contact": MUJOCO_CONTACT, "critic": (), **BESIDE}
 """Parts that runs of older versions do not name, and what they were."""

@@ -212,8 +212,8 @@ def tried(
     chi2 = scores(scorer, [m.theta for m in fitted], windows, dt)
     gain = significance.gains(now, chi2)
     groups = len(scorer.replayer.machine.groups)
-    p = significance.max_t(gain, rng, groups) if settings.judge == "max_t" else np.zeros(len(fitted))
-    if settings.judge == "bic":
+    p = significance.max_t(gain, rng, groups) if settings.selection == "max_t" else np.zeros(len(fitted))
+    if settings.selection == "bic":
         p = (_bic(scorer, fitted, train) >= 0).astype(float)
     before, after = excess(now), [excess(one) for one in chi2]
     share = np.array([removed(before, a) for a in after])

@@ -311,7 +311,7 @@ def _windows(comparison: Comparison, result: GapResult) -> np.ndarray:
     Raises:
         GapFileError: if the recordings are cut otherwise now.
     """
-    count, numbers = result.provenance.get("windows"), result.provenance.get("judged")
+    count, numbers = result.provenance.get("windows"), result.provenance.get("evaluated")
     if not numbers:  # an older version's result
         parts = comparison.split(np.random.default_rng(comparison.settings.seed))
         return parts.evaluated

@@ -209,7 +209,7 @@ def provenance(
         "seed": settings.seed,
         "physics_dt": comparison.dt,
         "windows": len(comparison.windows),
-        "judged": [int(k) for k in parts.evaluated],
+        "evaluated": [int(k) for k in parts.evaluated],
         "split": {name: sorted({recordings[e].meta.episode for e in episode[w]}) for name, w in kinds.items()},
     }
 

@@ -113,7 +113,7 @@ def timing(log: Log) -> tuple[list[Finding], dict[str, Delay]]:
         if joint in late and d.time > 0:
             findings.append(finding("delay", name, "suspect", d.time * 1e3, "ms", f"{shown}: delay or clock offset"))
         elif joint in late:
-            message = f"{shown}, before it is given: a clock offset, or a command logged late"
+            message = f"{shown}, before it is given: a clock offset, or a delayed log of the command"
             findings.append(finding("delay", name, "suspect", d.time * 1e3, "ms", message))
         elif apart:
             message = f"{shown}, the other joints after {middle * 1e3:.1f} ms: delay or clock offset of this one"

@@ -129,7 +129,7 @@ class QuadraticDrag(Effect):
 class Stribeck(Effect):
     """Dry friction that fades with speed: bound = bound + strength exp(-(|qd| / speed)^exponent).
 
-    Stribeck (1902): a film of lubricant carries a joint that moves. A joint breaks away late and with a jerk. It comes
+    Stribeck (1902): a lubricant layer carries a joint that moves. A joint breaks away with a jerk. It comes
     on top of ``coulomb``, from which slow and fast motion together tell it. Friction models of servos have speeds of
     0.1 to 1 rad/s and exponents of 1 upwards (BAM, ICRA 2025); LuGre's exponent is 2.
     """

@@ -163,7 +163,7 @@ class Launcher(Protocol):
     """Runs jobs until none is left that can run."""
 
     remote: bool
-    """Whether jobs run on other machines: what this one lacks is not asked."""
+    """Whether jobs run on other machines: what is missing on this one does not matter."""
 
     def check(self) -> None:
         """Refuse what cannot work, before anything is written; raise ConfigError or ``Expected``."""

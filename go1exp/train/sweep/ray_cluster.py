@@ -50,7 +50,7 @@ STOP_S = 120.0
 """Time for the checkpoints of jobs that are stopped, s."""
 
 QUIET = {"RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0", "RAY_BACKEND_LOG_LEVEL": "fatal", "RAY_USAGE_STATS_ENABLED": "0"}
-"""Variables for Ray: one line from us instead of many, tell nobody that it was used, and leave CUDA_VISIBLE_DEVICES as
+"""Variables for Ray: one line from us instead of many, send no usage statistics, and leave CUDA_VISIBLE_DEVICES as
 it is for CPU jobs."""
 
 
@@ -127,7 +127,7 @@ class Ray:
 
 
 def _refuse_silence(address: str | None) -> None:
-    """Refuse an address at which nobody listens: Ray itself would try for minutes.
+    """Refuse an address at which no server listens: Ray itself would try for minutes.
 
     Raises:
         Expected: naming it.

@@ -1,4 +1,4 @@
-"""Optuna's trials of several searches: what each is drawn with, and which of them nobody runs any more.
+"""Optuna's trials of several searches: what each is drawn with, and which of them do not run any more.
 
 A search that was killed could not say what became of its trials, and Optuna counts them as running for ever. So each
 search holds a lock in the folder while it lives, and its trials name it.
@@ -70,7 +70,7 @@ PATIENCE_S = 60.0
 def put_back(study: Any, folder: Path, patience: float = PATIENCE_S) -> bool:
     """Put the trials of searches that were killed in front, so that they go on in their run folders.
 
-    Returns whether some stay as they are: their trainings still ran after ``patience``, or nobody knows yet whose they
+    Returns whether some stay as they are: their trainings still ran after ``patience``, or it is unknown yet whose they
     are.
 
     Args:
@@ -106,7 +106,7 @@ def put_back(study: Any, folder: Path, patience: float = PATIENCE_S) -> bool:
 def go_on(study: Any, trial: Any, run: str) -> None:
     """Put in front the trial that goes on with a stopped one, unless that is done already.
 
-    To be called before the stopped one is told as failed: a search that is killed between the two has its trial still
+    To be called before the stopped one counts as failed: a search that is killed between the two has its trial still
     running, and ``put_back`` finds it. Two searches may do so at once; see ``is_superfluous``.
 
     Args:

@@ -39,7 +39,7 @@ KEYS: dict[str, tuple[str, str]] = {
 """Key of a condition -> word and unit; other keys stand for themselves, without a unit."""
 
 VERDICTS = (
-    "The whole 95 % interval, in brackets, is judged. met: it is within the limit; close: it exceeds, or may exceed,"
+    "The whole 95 % interval, in brackets, decides. met: it is within the limit; close: it exceeds, or may exceed,"
     " the limit by no more than the claim's tolerance; not met: it is beyond the limit, and the value by more than the"
     " tolerance; inconclusive: it is too wide, play more robots. n: number of robots."
 )
