@@ -224,9 +224,9 @@ def test_two_files_whose_paths_differ_by_a_sign_are_two(tmp_path: Path, monkeypa
         ("deploy x.zip feet=f.json", 2, "feet = f.json: calibrates sensors that report counts; those of robot=sim"),
         ("deploy walk.zip robot=sm", 2, "go1exp deploy: robot = 'sm': input should be 'sim' or 'go1'"),
         (
-            "train reward=shrt",
+            "train reward=qqq",
             2,
-            "go1exp train: reward=shrt: unknown choice of reward 'shrt'; known: clock, paper, paper_literal",
+            "go1exp train: reward=qqq: unknown choice of reward 'qqq'; known: clock, paper, paper_literal, spot",
         ),
     ],
 )
@@ -240,9 +240,9 @@ def test_bad_input_is_answered_in_one_line(words: str, status: int, said: str, r
 
 def test_a_users_own_choices_are_among_those_that_are_known(run: Run, tmp_path: Path) -> None:
     (tmp_path / "mine/reward").mkdir(parents=True)
-    (tmp_path / "mine/reward/short.yaml").write_text("gait: {weight: 1.0}\n")
-    said = "go1exp train: reward=shrt: unknown choice of reward 'shrt'; did you mean 'short'?\n"
-    assert run("train", "--config-dir", "mine", "reward=shrt") == (2, said)
+    (tmp_path / "mine/reward/lively.yaml").write_text("gait: {weight: 1.0}\n")
+    said = "go1exp train: reward=livly: unknown choice of reward 'livly'; did you mean 'lively'?\n"
+    assert run("train", "--config-dir", "mine", "reward=livly") == (2, said)
 
 
 @pytest.mark.parametrize("folder", ["rand", "randomization"])
