@@ -684,40 +684,80 @@ def test_robots_start_on_random_levels_up_to_the_curriculums(make_core: Make, cu
     assert torch.equal(core.level, before)
 
 
-def test_levels_go_up_after_a_long_walk_down_after_a_short_one_and_anywhere_past_the_top(make_core: Make) -> None:
-    """Told to walk 3 m/s for 0.2 s episodes: down under 0.3 m, up past half a tile of 8 m."""
-    core = make_core(*QUIET, *ROUGH, "command.lin_vel_x=3.0", "sim.episode_s=0.2", num_envs=40, noise=False)
+COMMANDS = {
+    "fast": ((0.8, 0.8), (0.0, 0.0), (0.0, 0.0), 10.0),
+    "slow": ((0.1, 0.1), (0.0, 0.0), (0.0, 0.0), 10.0),
+    "circle": ((1.0, 1.0), (0.0, 0.0), (1.5, 1.5), 10.0),
+    "turn": ((0.0, 0.0), (0.0, 0.0), (1.0, 1.0), 10.0),
+    "changing": ((-1.0, 1.0), (-0.5, 0.5), (-1.5, 1.5), 0.3),
+    "standing": ((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), 10.0),
+}
+
+
+@pytest.mark.parametrize(
+    ("walk", "share", "moves"),
+    [
+        *((walk, 1.0, 1) for walk in ("fast", "slow", "circle", "turn", "changing")),
+        *((walk, share, -1) for walk in ("fast", "slow", "circle", "turn", "changing") for share in (0.0, -1.0, 2.0)),
+        ("fast", 0.5, 0),
+        ("standing", 0.0, 0),
+    ],
+)
+def test_levels_rise_where_the_commanded_path_is_tracked(walk: str, share: float, moves: int, make_core: Make) -> None:
+    """Trunks that are moved by ``share`` of the commanded twist, exactly, 4 s long."""
+    x, y, yaw, hold = COMMANDS[walk]
+    command = [
+        f"command.{k}=[{low},{high}]"
+        for k, (low, high) in zip(("lin_vel_x", "lin_vel_y", "ang_vel_z"), (x, y, yaw), strict=True)
+    ]
+    hold_time = f"command.hold_time=[{hold},{hold}]"
+    core = make_core(
+        *("rand=none", "event=none", "termination=none", *ROUGH, "command=paper", *command, hold_time),
+        *("command.standing_fraction=0.0", "sim.episode_s=4.0"),
+        num_envs=6,
+        noise=False,
+    )
     core.reset()
-    walked = [4.2, 0.1, 1.0, 3.8, 4.2, 0.0, 0.1, 4.2] * 5
-    level = [1, 2, 2, 0, 0, 1, 0, 3] * 5
-    expected = [2, 1, 2, 0, 1, 0, 0, None] * 5
-    core.level.copy_(torch.tensor(level))
-    core.spawn.copy_(torch.as_tensor(core.terrain.tile_origins[level, core.tile_column.numpy()]))
-    direction = np.random.default_rng(0).uniform(0.0, 2.0 * np.pi, 40)
-    for k in range(1, 11):
-        if k == 10:
-            away = np.array(walked)[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
-            core.backend.qpos[:, :2] = core.spawn[:, :2].double() + torch.as_tensor(away)
-            core.backend.qpos[:, 2], core.backend.qvel[:] = 2.0, 0.0
-        assert core.level.tolist() == level
-        ended = core.step(torch.zeros(40, 12)).truncated
+    core.level.fill_(1)
+    core.reset()
+    pose = core.backend.qpos[:, :7].clone()
+    heading, dt = torch.zeros(6, dtype=torch.float64), core.task.sim.physics_dt
+
+    def drive() -> None:
+        twist = share * core.command.value.double()
+        forward, left = twist[:, 0], twist[:, 1]
+        heading.add_(dt * twist[:, 2])
+        pose[:, 0] += dt * (forward * heading.cos() - left * heading.sin())
+        pose[:, 1] += dt * (forward * heading.sin() + left * heading.cos())
+        pose[:, 3], pose[:, 6] = (heading / 2).cos(), (heading / 2).sin()
+        core.backend.qpos[:, :7] = pose
+
+    core.driver = drive
+    steps = core.task.sim.episode_steps
+    for k in range(steps):
+        assert core.level.tolist() == [1] * 6, k
+        ended = core.step(torch.zeros(6, 12)).truncated
     assert ended.all()
-    for i in range(40):
-        if expected[i] is not None:
-            assert core.level[i] == expected[i], (walked[i], level[i])
-    anywhere = [int(core.level[i]) for i in range(40) if expected[i] is None]
-    assert set(anywhere) <= set(range(4))
-    for i in range(40):
-        origin = core.terrain.tile_origins[int(core.level[i]), int(core.tile_column[i])]
-        np.testing.assert_allclose(core.backend.qpos[i, :3], origin + RAISED, atol=1e-6)
-    assert core.drain_metrics(10)["curriculum/terrain_level"] == pytest.approx(core.level.float().mean().item())
+    assert core.level.tolist() == [1 + moves] * 6
+
+
+def test_a_fall_counts_as_the_rest_of_the_path_untracked(make_core: Make) -> None:
+    core = make_core("rand=none", "event=none", *ROUGH, "command=forward", "sim.episode_s=4.0", num_envs=3, noise=False)
+    core.reset()
+    core.level.fill_(2)
+    core.path.total[:] = torch.tensor([[3.0, 3.0], [3.0, 3.0], [0.0, 0.0]])
+    core.steps[:] = torch.tensor([20, 180, 20])  # of 200
+    core._first_step[2] = 20
+    core.backend.qpos[:, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0])  # upside down
+    assert core.step(torch.zeros(3, 12)).terminated.all()
+    assert core.level.tolist() == [1, 3, 1]
 
 
 def test_robots_past_the_top_level_spread_over_all_levels(make_core: Make) -> None:
     core = make_core(*QUIET, *ROUGH, "sim.episode_s=0.02", num_envs=200, noise=False)
     core.reset()
     core.level.fill_(3)
-    core.backend.qpos[:, :2] = core.spawn[:, :2].double() + 3.5
+    core.path.total[:] = 1.0
     core.backend.qpos[:, 2] = 2.0
     core.step(torch.zeros(200, 12))
     assert np.bincount(core.level.numpy(), minlength=4).min() > 25

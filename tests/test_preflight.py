@@ -128,3 +128,15 @@ def test_online_logging_without_a_key_is_refused(tmp_path: Path, monkeypatch: py
     with pytest.raises(ConfigError, match="there is no API key; set WANDB_API_KEY") as caught:
         metrics.check_account(LoggerConfig(csv=True, tensorboard=False, wandb=account))
     assert len(caught.value.problems) == 1
+
+
+# ---------------------------------------------------------------------- curriculum
+
+
+@pytest.mark.parametrize("choice", ["command.standing_fraction=1.0", "command.zero_fraction=1.0", "terrain.rows=1"])
+def test_a_curriculum_that_promotes_no_robot_is_warned_of(choice: str) -> None:
+    rough = ("terrain=rough", "curriculum=terrain_level", "curriculum.terrain_level.start_level_max=0")
+    with pytest.warns(UserWarning, match=r"^curriculum\.terrain_level: promotes no robot; "):
+        preflight.warn_of_idle_curriculum(config(*rough, choice))
+    preflight.warn_of_idle_curriculum(config(*rough))
+    preflight.warn_of_idle_curriculum(config("terrain=rough", choice))

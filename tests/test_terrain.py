@@ -324,24 +324,23 @@ def test_outside_the_field_the_nearest_edge_counts_and_nan_stays_nan() -> None:
 @pytest.mark.parametrize(
     ("level", "distance", "commanded", "expected"),
     [
-        (3, 4.1, 0.0, 4),  # past half a tile: up
-        (3, 4.1, 60.0, 4),  # up wins over down, however much was asked
-        (3, 4.0, 0.0, 3),  # exactly half a tile is not past it
-        (3, 3.9, 10.0, 2),  # less than half of what was asked: down
-        (3, 3.9, 7.8, 3),  # exactly half is enough to stay
-        (3, 3.9, 7.0, 3),  # between the two: stay
-        (3, 0.0, 0.0, 3),  # a zero command never moves down
+        (3, 6.0, 10.0, 4),  # exactly enough: up
+        (3, 0.6, 1.0, 4),  # a slow command as well
+        (3, 5.9, 10.0, 3),  # between the two: stay
+        (3, 4.0, 10.0, 3),
+        (3, 3.9, 10.0, 2),  # too little: down
+        (3, 0.0, 0.0, 3),  # a zero command moves no robot
         (0, 0.0, 20.0, 0),  # the lowest level is a floor
-        (9, 5.0, 20.0, 7),  # past the top: the random level
-        (9, 3.0, 0.0, 9),  # staying at the top is not passing it
+        (9, 15.0, 20.0, 7),  # past the top: the random level
+        (9, 10.0, 20.0, 9),  # staying at the top is not passing it
         (9, 0.0, 20.0, 8),
-        (8, 5.0, 20.0, 9),
+        (8, 15.0, 20.0, 9),
     ],
 )
 def test_terrain_levels_move_by_the_rule(level: int, distance: float, commanded: float, expected: int) -> None:
     after = TerrainLevel()(
         torch.tensor([level, 5]),
-        torch.tensor([distance, 3.0]),
+        torch.tensor([distance, 2.5]),
         torch.tensor([commanded, 5.0]),
         8.0,
         9,

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import warnings
 
+import numpy as np
 import torch
 
 from go1exp import robot
@@ -30,12 +32,27 @@ def check(config: TrainConfig) -> None:
         FileNotFoundError: if it is not there.
     """
     check_devices(config)
+    warn_of_idle_curriculum(config)
     check_shares(config)
     check_measures(config)
     check_memory(config, engine_device(config))
     metrics.check_account(config.logger)
     if any("file" in term.parameters for term, _ in nested_actuators(config.task.actuator)):
         Go1Core(config.task, 1)
+
+
+def warn_of_idle_curriculum(config: TrainConfig) -> None:
+    """Warn where the curriculum can promote no robot: on one kind of ground, or where every command is zero."""
+    task, asked = config.task, config.task.command.parameters
+    axes = [asked[key] for key in ("lin_vel_x", "lin_vel_y", "ang_vel_z") if key in asked]
+    reasons = {
+        "terrain.rows = 1: there is no higher level": task.terrain.rows == 1,
+        "every command is zero, and a robot without a command keeps its level": asked.get("standing_fraction") == 1.0
+        or asked.get("zero_fraction") == 1.0
+        or (len(axes) == 3 and not np.any(axes)),
+    }
+    for reason in (reason for reason, holds in reasons.items() if holds and task.curriculum):
+        warnings.warn(f"curriculum.{task.curriculum[0].key}: promotes no robot; {reason}", stacklevel=3)
 
 
 def engine_device(config: TrainConfig) -> torch.device:

@@ -21,6 +21,7 @@ from go1exp.base.tensors.rotation import projected_gravity, rotate_inverse
 from go1exp.config.schema.training import Value
 from go1exp.mdp.actions import clipped, joint_target, of_shape
 from go1exp.mdp.commands import UniformVelocity, WideningVelocity
+from go1exp.mdp.curricula import TrackedPath
 from go1exp.mdp.feet import Feet
 from go1exp.mdp.ground import GroundHeight, HeightScan
 from go1exp.mdp.kinematics import KinematicState, lift
@@ -100,14 +101,13 @@ class Go1Core:
         self.steps, self._first_step, self.episode_return = *(zeros(dtype=torch.int64) for _ in range(2)), zeros()
         self._last_qpos, self._last_qvel = torch.zeros_like(self.backend.qpos), torch.zeros_like(self.backend.qvel)
         self.reward_sums = self.terms.sums
-        self.feet = Feet(num_envs, task.sim.physics_dt, self.device)
+        self.feet, self.path = Feet(num_envs, task.sim.physics_dt, self.device), TrackedPath(num_envs, self.device)
         self.gait_log = GaitLog(num_envs, time.policy_dt, self.device)
         self.task_log = TaskLog(time.policy_dt, self.device)
         self._touched, self._calf_touched = map(torch.zeros_like, (self._link_contacts, self._foot_contact[..., 0]))
         self._nominal = torch.as_tensor(robot.NOMINAL_STANCE, dtype=torch.float32, device=self.device)
-        self._started = False
+        self._started, self._evidence, self.captures = False, Evidence(), task.backend.captures
         self._deferred = self.device.type == "cuda"  # where to look at a value is to wait for it
-        self._evidence, self.captures = Evidence(), task.backend.captures
         self._captured: CapturedStep | None = None
 
     def _build_ground(self, first_env: int) -> None:
@@ -209,6 +209,7 @@ class Go1Core:
         if self._held is None:
             lift(fresh, self._ground if self._bounded else None)
         self.backend.reset(mask, qpos, qvel)
+        self.path.begin(mask, fresh.base_pos_w.float(), fresh.base_quat_w.float())
         for part in (self.feet, self.gait_log, self.terms):
             part.reset(mask)
         for tensor in (self.action, self.previous_action, self.joint_acc):
@@ -236,6 +237,8 @@ class Go1Core:
         self.steps += 1
         s = self.snapshot()
         self.gait_log.add(s)
+        if self._curriculum:
+            self.path.advance(self.task.sim.policy_dt, s.command, self._state.base_pos_w.float(), s.base_quat_w)
         terminated = self.terms.terminated(s)
         cut = self.terms.cut_short(self._off_map(), s)
         truncated = ((self.steps >= self.task.sim.episode_steps) | cut) & ~terminated
@@ -250,7 +253,7 @@ class Go1Core:
             self._evidence.note(self._suspects(final_observation), episode_length)
 
         ended = terminated | truncated
-        self._move_levels(ended)
+        self._move_levels(ended, terminated)
         self._restarts(ended)
         self._advance_world(ended)
         observation = self.terms.frames.begun(*self._frame(self.snapshot()), ended)
@@ -277,25 +280,23 @@ class Go1Core:
 
     def _advance_world(self, restart: Tensor) -> None:
         """Let the policy period pass for commands and events; ``restart`` (N,) begins anew."""
-        dt = self.task.sim.policy_dt
-        self.command.advance(dt, restart)
+        self.command.advance(self.task.sim.policy_dt, restart)
         for happening in self.events.values():
-            happening.advance(self._state, dt, restart)
+            happening.advance(self._state, self.task.sim.policy_dt, restart)
 
     def _off_map(self) -> Tensor:
         """(N,) bool: at the edge of a height field, beyond which there is no ground."""
         xy, (low, high) = self._state.base_pos_w[:, :2], self._map
         return ((xy < low) | (xy > high)).any(-1)
 
-    def _move_levels(self, ended: Tensor) -> None:
+    def _move_levels(self, ended: Tensor, fallen: Tensor) -> None:
         """Apply the curriculum to the episodes that ended."""
         for rule in self._curriculum:
-            travelled = (self._state.base_pos_w[:, :2] - self.spawn[:, :2]).norm(dim=-1).float()
-            steps = self.task.sim.episode_steps - self._first_step  # a first episode may begin part-way
-            commanded = self.command.value[:, :2].norm(dim=-1) * (steps * self.task.sim.policy_dt)
+            tracked, commanded = self.path.lengths().unbind(1)
+            whole = (self.task.sim.episode_steps - self._first_step) / (self.steps - self._first_step)
+            commanded = torch.where(fallen, commanded * whole, commanded)
             anywhere = self.random.stream("relevel").integers(self._max_level + 1, 1).squeeze(1)
-            size = self.task.terrain.tile_size
-            after = rule(self.level, travelled, commanded, size, self._max_level, anywhere)
+            after = rule(self.level, tracked, commanded, self.task.terrain.tile_size, self._max_level, anywhere)
             self.level.copy_(torch.where(ended, after, self.level))
 
     def ground_height(self, xy: Tensor) -> Tensor | float:
@@ -304,9 +305,8 @@ class Go1Core:
 
     def snapshot(self) -> Snapshot:
         """Return the present moment as the MDP sees it; staleness of sensors as in ``sim/physics/backend.py``."""
-        state = self._state
+        state, foot_pos = self._state, self._foot_pos_w.float()
         quat = state.base_quat_w.float()
-        foot_pos = self._foot_pos_w.float()
         return Snapshot(
             base_pos_w=state.base_pos_w.float(),
             base_quat_w=quat,
@@ -381,7 +381,7 @@ class Go1Core:
 
     def _parts(self) -> dict[str, Any]:
         """Everything with a state of its own."""
-        names = ("backend", "random", "plant", "command", "feet", "gait_log", "task_log")
+        names = ("backend", "random", "plant", "command", "feet", "gait_log", "task_log", "path")
         events = {f"event.{name}": part for name, part in self.events.items()}
         return {**{name: getattr(self, name) for name in names}, **events, **self.terms.parts()}
 
@@ -395,6 +395,6 @@ class Go1Core:
         for name in self._BUFFERS:
             getattr(self, name).copy_(state["core"][name])
         for name, part in self._parts().items():
-            if name in state or name != "task_log":  # which older checkpoints do not have, and which begins empty
+            if name in state or name not in ("task_log", "path"):  # which checkpoints of 0.1 do not have
                 part.load_state_dict(state[name])
         self._started = state["started"]

@@ -34,7 +34,7 @@ def build_fixed_base(
     own motors and sensors left out. Each link takes the name of its joint, so that effects on links find it.
 
     Args:
-        file: MJCF, whose path names what it includes.
+        file: MJCF or URDF, whose path names what it includes.
         base: body that is fixed to the world.
         joints: hinges in the order in which the model will have them, J.
         effort: peak torque of each, (J,) N m.
@@ -43,7 +43,7 @@ def build_fixed_base(
         mounted: the base has the joints of ``sim/physics/scene.py``, before its own.
 
     Raises:
-        FixedBaseError: if the file is missing or no MJCF, has no such body or hinge, has them in another order, or has
+        FixedBaseError: if the file is missing or no model, has no such body or hinge, has them in another order, or has
             two of them in one link.
     """
     if not file.is_file():
@@ -52,6 +52,7 @@ def build_fixed_base(
         spec = mujoco.MjSpec.from_file(str(file))
     except ValueError as error:
         raise FixedBaseError(f"mjcf = {str(file)!r}: not a MuJoCo model ({_in_a_line(error)})") from None
+    spec.compiler.fusestatic = False  # the base, which has no joint, must remain a body of its own
     _checked(spec, file, base, joints)
     for joint in list(spec.joints):
         if joint.name not in joints:
