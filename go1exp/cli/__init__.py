@@ -95,8 +95,10 @@ def _run(arguments: list[str]) -> int:
     if rest and rest[0] in SUBVERBS.get(verb, ()):
         verb, rest = f"{verb}_{rest[0]}", rest[1:]
     if {"-h", "--help"} & {*rest}:
+        from go1exp.cli.app import defer
         from go1exp.cli.helptext import show
 
+        defer("torch")  # help computes nothing
         show(verb, f"go1exp {verb.replace('_', ' ')}", rest)
         return 0
     from go1exp.cli.app import app_of

@@ -76,11 +76,12 @@ def _evaluate(runs: Study, settings: ReportSettings, protocols: Sequence[Chosen 
 def lines(made: Report) -> list[str]:
     """Return the lines for a terminal: groups, excluded runs, remarks, verdicts."""
     from go1exp.base.report.table import interval_text, number
-    from go1exp.evaluate.report.tables import counts
+    from go1exp.base.wording import counted
+    from go1exp.evaluate.report.tables import about_baseline, counts
 
     runs = sum(len(g.runs) for g in made.groups)
-    text_lines = [f"{runs} runs in {len(made.groups)} groups; baseline: {made.baseline.name}"]
-    text_lines += [f"  {len(g.runs):3} runs  {g.name}" for g in made.groups]
+    text_lines = [f"{counted(runs, 'run')} in {counted(len(made.groups), 'group')}; {about_baseline(made)}"]
+    text_lines += [f"  {counted(len(g.runs), 'run'):>8}  {g.name}" for g in made.groups]
     text_lines += [f"excluded: {a.label}: {a.state} ({a.cause})" for a in made.study.absent]
     text_lines += [f"note: {note}" for note in made.study.notes]
     for outcome in made.outcomes:

@@ -137,6 +137,7 @@ def listing(labels: Sequence[str], width: float = WIDTH, row: float = 0.22, labe
     panel.set_yticks(range(len(labels)), labels, fontsize=7.5)
     panel.set_ylim(len(labels) - 0.4, -0.6)
     panel.grid(axis="y", visible=False)
+    panel.locator_params(axis="x", nbins=5)  # numbers of five digits stay apart
     panel.set_xlabel(label)
     return figure, panel
 

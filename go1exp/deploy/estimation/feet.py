@@ -17,9 +17,9 @@ LEGS = robot.NUM_LEGS
 SINGULAR = 1e-6
 """Smallest determinant of a leg's Jacobian, m3/rad3: a straighter leg's torques do not give the force along it."""
 
-LIGHT, STANDING = 10.0, 60.0
-"""Sum of the feet's vertical forces by torques below which they are unloaded, and above which a Go1 stands, N
-(chosen: a Go1 weighs 125 N, and joint friction adds up to 2 N a foot)."""
+HELD, LIGHT, STANDING = -30.0, 10.0, 60.0
+"""Sums of the feet's vertical forces by torques, N: unloaded between the first two, standing above the third
+(chosen: a Go1 weighs 125 N, joint friction adds up to 2 N a foot, and held legs that hang in the air take 3 N each)."""
 
 
 class CalibrationError(Expected):
@@ -139,7 +139,7 @@ def calibrated(
         before: the present calibration.
     """
     total = float(by_torque.sum())
-    if abs(total) < LIGHT:
+    if HELD < total < LIGHT:
         scale = None if before is None else before.scale
         return FootCalibration(tuple(map(float, counts)), scale), "zeros, from a lying or suspended robot"  # type: ignore[arg-type]
     if total < STANDING or by_torque.min() < 0.3 * total / LEGS:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import cycle
 from typing import TYPE_CHECKING, Any
@@ -36,7 +36,16 @@ def short(name: str, letters: int) -> str:
     return name if len(name) <= letters else f"{name[: letters - 1]}…"
 
 
-def learning(curves: Sequence[Curve], baseline: str) -> list[Drawing]:
+Looks = Mapping[str, tuple[str, str]]
+"""Group -> colour and line style, the same in all figures of a report."""
+
+
+def looks(groups: Sequence[str]) -> Looks:
+    """Return colour and line style of each group."""
+    return dict(zip(groups, cycle([(c, s) for s in STYLES for c in COLOURS]), strict=False))
+
+
+def learning(curves: Sequence[Curve], baseline: str, of_groups: Looks) -> list[Drawing]:
     """Return one drawing for each metric, over steps and over time."""
     drawings = []
     for number, metric in enumerate(dict.fromkeys(c.metric for c in curves)):
@@ -46,21 +55,20 @@ def learning(curves: Sequence[Curve], baseline: str) -> list[Drawing]:
         )
         if len({c.group for c in of_metric}) > FEW:
             caption += f" With so many groups, only the band of the baseline ({baseline}) is drawn."
-        paint = partial(_learning, of_metric, baseline)
+        paint = partial(_learning, of_metric, baseline, of_groups)
         drawings.append(Drawing(f"curve{number}", metric, caption, paint, wide=True))
     return drawings
 
 
-def _learning(curves: Sequence[Curve], baseline: str) -> Painting:
+def _learning(curves: Sequence[Curve], baseline: str, of_groups: Looks) -> Painting:
     axes_drawn = [axis for axis in AXES if any(c.axis == axis for c in curves)]
     names = list(dict.fromkeys(c.group for c in curves))
     figure, axes = panels(1, len(axes_drawn), height=2.9, width=WIDE, sharey=True)
-    looks = dict(zip(names, cycle([(c, s) for s in STYLES for c in COLOURS]), strict=False))
     for panel, axis in zip(axes[0], axes_drawn, strict=True):
         of_axis = [c for c in curves if c.axis == axis]
         banded = [c for c in of_axis if len(names) <= FEW or c.group == baseline]
         for curve in of_axis:
-            colour, style = looks[curve.group]
+            colour, style = of_groups[curve.group]
             if curve in banded:
                 band(panel, curve.x, curve.low, curve.high, colour)
             width = 1.8 if curve.group == baseline else 1.1
@@ -82,7 +90,9 @@ def _limits(middles: Sequence[Any], bounds: Sequence[Any]) -> tuple[float, float
     return max(low - room, float(every.min()) - 0.05 * room), min(high + room, float(every.max()) + 0.05 * room)
 
 
-def forests(figures: Sequence[Figure], main: Sequence[str], baseline: str, key: str) -> list[Drawing]:
+def forests(
+    figures: Sequence[Figure], main: Sequence[str], baseline: str, key: str, of_groups: Looks
+) -> list[Drawing]:
     """Return one drawing for each main quantity: groups from top to bottom with their intervals."""
     drawings = []
     for name in main:
@@ -92,16 +102,16 @@ def forests(figures: Sequence[Figure], main: Sequence[str], baseline: str, key: 
                 f"{those[0].column.meaning}. Dots: runs; bar: interquartile mean with its 95 % interval over runs. "
                 f"Dashed: {baseline}."
             )
-            paint = partial(_forest, those, baseline)
+            paint = partial(_forest, those, baseline, of_groups)
             title = f"{key}: {label(those[0].column)}"
             drawings.append(Drawing(f"forest{key}{name}".replace("_", ""), title, caption, paint))
     return drawings
 
 
-def _forest(figures: Sequence[Figure], baseline: str) -> Painting:
+def _forest(figures: Sequence[Figure], baseline: str, of_groups: Looks) -> Painting:
     figure, panel = listing([short(f.group, 34) for f in figures], row=0.27, label=label(figures[0].column))
     for place, f in enumerate(figures):
-        colour = COLOURS[1] if f.group == baseline else COLOURS[0]
+        colour, _ = of_groups[f.group]
         panel.plot(f.values, np.full(len(f.values), place), ".", color=colour, alpha=0.45, ms=5, mec="none")
         if np.isfinite(f.runs.low):
             panel.plot([f.runs.low, f.runs.high], [place, place], color=colour, lw=1.6)

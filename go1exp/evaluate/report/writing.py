@@ -12,9 +12,9 @@ from typing import Any
 from go1exp.base.files import write_json, write_text
 from go1exp.base.report.page import Page, provenance, render, sections
 from go1exp.base.wording import counted
-from go1exp.evaluate.report.drawings import forests, importances, learning
+from go1exp.evaluate.report.drawings import forests, importances, learning, looks
 from go1exp.evaluate.report.made import Report
-from go1exp.evaluate.report.tables import PlainRow, plain_rows, tables
+from go1exp.evaluate.report.tables import PlainRow, about_baseline, plain_rows, tables
 from go1exp.evaluate.rows import finite
 from go1exp.evaluate.statistics.compare import ORDER
 
@@ -30,10 +30,11 @@ NOTES = (
 def page(made: Report) -> str:
     """Return the page, one HTML document that needs no other file."""
     count = sum(len(g.runs) for g in made.groups)
-    drawings = learning(made.curves, made.baseline.name)
+    of_groups = looks([g.name for g in made.groups])
+    drawings = learning(made.curves, made.baseline.name, of_groups)
     for outcome in made.outcomes:
         key = outcome.evaluation.name
-        drawings += forests(outcome.figures, outcome.evaluation.main, made.baseline.name, key)
+        drawings += forests(outcome.figures, outcome.evaluation.main, made.baseline.name, key, of_groups)
         drawings += importances(outcome.sensitivities, key)
     names = ", ".join(dict.fromkeys(Path(f).resolve().name for f in made.settings["folders"]))
     excluded = len(made.study.absent)
@@ -43,7 +44,7 @@ def page(made: Report) -> str:
             title=f"report: {names}",
             kind="go1exp report",
             heading=names,
-            lead=f"{count} runs in {len(made.groups)} groups; baseline: {made.baseline.name}.",
+            lead=f"{count} runs in {len(made.groups)} groups; {about_baseline(made)}.",
             verdicts=_head(made),
             facts=[*([f"{counted(excluded, 'run')} excluded, listed below."] * bool(excluded)), *made.study.notes],
             sections=[
