@@ -8,6 +8,7 @@ with noise, with nothing random (``rand=none``), with noise at 100 Hz, on the gr
 does to a robot, and under the acceptance criteria (``go1exp/evaluate/criteria.py``): stiff feet, dry friction, delay.
 ``first`` is the run that ``run`` started from (``start_from``): its configuration, origin and curves go to
 ``first_stage``. Without ``run`` the present policy is evaluated again.
+A tree with changes, or a run from one, is refused: the origin of a shipped policy is a commit.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from typing import Any
 
 import torch
 
+from benchmarks.results import commit
 from go1exp.base.paths import data_root
 from go1exp.cli import subjects
 from go1exp.config.compose import compose
@@ -97,6 +99,15 @@ def evaluate_criteria(task: TaskConfig, policy: Policy, about: dict[str, Any]) -
     return report
 
 
+def refuse_changes(present: str, runs: Sequence[Path]) -> None:
+    """Raise SystemExit if the policy's origin is no commit: files differ from it now, or did in one of its runs."""
+    if present.endswith("+") or present == "unknown":
+        raise SystemExit(f"commit {present}: files differ from it, or it is unknown; commit them first")
+    for run in runs:
+        if json.loads((run / "meta.json").read_text()).get("git_dirty"):
+            raise SystemExit(f"{run}: trained with files that differ from its commit (meta.json: git_dirty)")
+
+
 def main(arguments: Sequence[str]) -> None:
     """Copy and evaluate."""
     given = dict(a.split("=", 1) for a in arguments if "=" in a)
@@ -107,6 +118,7 @@ def main(arguments: Sequence[str]) -> None:
         raise SystemExit(
             f"usage: python -m benchmarks.ship_policy [run=RUN] name=NAME [first=RUN] [episodes=31] [only={known}]"
         )
+    refuse_changes(commit(), [Path(given[key]) for key in ("run", "first") if key in given])
     to = data_root() / "assets" / "policies" / given["name"]
     if "run" in given:
         shipped(Path(given["run"]), to)

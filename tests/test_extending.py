@@ -32,6 +32,8 @@ def files() -> dict[str, str]:
     """Name -> content; the blocks of one file stand one after the other."""
     texts: dict[str, str] = {}
     for kind, text in BLOCKS:
+        if text.startswith("# @package"):
+            texts["mine/experiment/calm.yaml"] = text
         first, _, rest = text.partition("\n")
         if kind in ("python", "yaml", "csv") and (match := re.fullmatch(r"# (\S+\.(?:py|yaml|csv))", first)):
             texts[match[1]] = texts.get(match[1], "") + (text if kind == "python" else rest)

@@ -102,6 +102,29 @@ def test_the_commands_of_the_readme_work_one_after_the_other(tmp_path: Path) -> 
         assert (tmp_path / made).exists(), made
 
 
+# ---------------------------------------------------------------------- shell
+
+
+def shell_lines(text: str) -> list[str]:
+    """The lines of a text that run go1exp or make, without their comments."""
+    lines = re.findall(r"^\s*(?:\$ )?((?:go1exp|make) .*)$", text, re.MULTILINE)
+    return [re.split(r"\s#", line)[0] for line in lines if not re.match(r"go1exp [\w -]+: |go1exp trains ", line)]
+
+
+def unquoted(line: str) -> str:
+    return re.sub(r"'[^']*'|\"[^\"]*\"", "", line)
+
+
+def test_shell_lines_quote_what_bash_or_zsh_would_interpret() -> None:
+    texts = {page: "\n".join(re.findall(r"^```.*?^```$", page.read_text(), re.M | re.S)) for page in PAGES}
+    texts |= {
+        file: yaml.safe_load(file.read_text())["hydra"]["help"]["footer"] for file in (ROOT / "conf").glob("*.yaml")
+    }
+    lines = [(page, line) for page, text in texts.items() for line in shell_lines(text)]
+    assert len(lines) > 200
+    assert [(str(page), line) for page, line in lines if re.search(r"[][{}~*?()]", unquoted(line))] == []
+
+
 # ---------------------------------------------------------------------- pages
 
 

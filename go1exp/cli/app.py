@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import sys
+import time
 import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -88,6 +89,7 @@ class App:
             print(f"{title}: {message}", file=sys.stderr)
             return code
         finally:
+            _announced.clear()
             while _bars:  # one that an error leaves behind hides the terminal's cursor
                 _bars.pop().stop()
             warnings.formatwarning = formatwarning
@@ -209,12 +211,31 @@ def discard(run: Path, of_lock: Sequence[str] = ()) -> None:
 
 
 _bars: list[Any] = []
+_announced: list[str] = []
+
+LINE_PERIOD = 5.0
+"""Least time between two lines of progress when there is no terminal, s."""
+
+
+def announce(what: str) -> None:
+    """Print what begins, once, where there is no terminal: libraries take seconds to load."""
+    if not sys.stderr.isatty() and what not in _announced:
+        _announced.append(what)
+        print(f"{what} ...", file=sys.stderr, flush=True)
 
 
 def spinner(total: int, what: str) -> Callable[[int, int], None]:
-    """Return a callback ``(done, total)`` that shows a progress bar in a terminal and nothing elsewhere."""
+    """Return a callback ``(done, total)`` that shows a progress bar in a terminal, and lines elsewhere."""
     if not sys.stderr.isatty():
-        return lambda done, total: None
+        announce(what)
+        said = [time.monotonic()]
+
+        def say(done: int, total: int) -> None:
+            if done < total and time.monotonic() - said[0] >= LINE_PERIOD:
+                said[0] = time.monotonic()
+                print(f"{what}: {100 * done / total:.0f} %", file=sys.stderr, flush=True)
+
+        return say
     from rich.console import Console
     from rich.progress import Progress
 

@@ -75,6 +75,7 @@ GOALS = {
 
 def _task(container: dict[str, Any]) -> None:
     settings = parse(BenchSettings, container)
+    show = spinner(settings.rounds, f"measuring {settings.suite}")
 
     from go1exp.sim.task import parse_train
 
@@ -86,7 +87,6 @@ def _task(container: dict[str, Any]) -> None:
     from go1exp.evaluate.bench import env, train
     from go1exp.evaluate.bench.measure import machine
 
-    show = spinner(settings.rounds, f"measuring {settings.suite}")
     timing = (settings.num_envs, settings.rounds, settings.seconds, show)
     if settings.suite == "env":
         figures = env.run(config.task, overrides, *timing)
@@ -99,7 +99,7 @@ def _task(container: dict[str, Any]) -> None:
     elif settings.suite == "report":
         from go1exp.evaluate.bench import report
 
-        figures = report.run(container, spinner(1, "measuring report"))
+        figures = report.run(container, show)
     elif settings.suite == "mpc":
         figures = _mpc(config.task, timing)
     elif on_gpu:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from go1exp.base.files import write_json, write_text
 from go1exp.cli import subjects
-from go1exp.cli.app import App, parse, spinner
+from go1exp.cli.app import App, announce, parse, spinner
 from go1exp.cli.evaluate import RATES, note_replaced, refuse
 from go1exp.cli.places import writable
 from go1exp.cli.subjects import Named, Variation, agent, varied
@@ -38,6 +38,7 @@ def _task(container: dict[str, Any]) -> None:
     if folder.exists() and not folder.is_dir():
         raise ConfigError([f"folder = {settings.folder!r}: is a file"])
 
+    announce(f"comparing {', '.join(settings.subjects)}")
     from go1exp.evaluate.protocol.playing import Rates, play, refuse_lengths
 
     first = agent(named_subjects[0][0], other)

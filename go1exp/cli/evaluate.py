@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field
 
 from go1exp.cli import subjects
-from go1exp.cli.app import App, parse, spinner
+from go1exp.cli.app import App, announce, parse, spinner
 from go1exp.cli.places import checkpoint_file, trained, writable
 from go1exp.cli.subjects import Named, agent
 from go1exp.config.choices import config_folder, load
@@ -190,11 +190,11 @@ def writable_file(out: Path) -> None:
         raise ConfigError([f"out = {str(out)!r}: its folder {reason}"]) from None
 
 
-def note_replaced(folder: Path, files: Sequence[str]) -> None:
-    """Print which results of an earlier call the new ones will replace."""
-    present = [name for name in files if (folder / name).exists()]
+def note_replaced(folder: Path, files: Sequence[str], other: str = "folder=NAME") -> None:
+    """Print which results of an earlier call the new ones will replace, and the setting that keeps them."""
+    present = [name for name in files if (folder / name).is_file()]
     if present:
-        print(f"note: {folder} holds {', '.join(present)} of an earlier call; new ones replace them (or: folder=NAME)")
+        print(f"note: {folder} holds {', '.join(present)} of an earlier call; new ones replace them (or: {other})")
 
 
 def play_protocols(
@@ -257,6 +257,7 @@ def _protocols(settings: Any, protocols: list[Any], conditions: _Conditions) -> 
     """Play what is not the grid."""
     refuse_rates(protocols, conditions.controller.name if conditions.controller else None, settings.policy_dt)
     subject = subjects.subject_of(settings, conditions.controller, "protocols")
+    announce(f"evaluating {subject.label}")
     folder = Path(settings.folder or subject.folder)
     if folder.exists() and not folder.is_dir():
         raise ConfigError([f"folder = {str(folder)!r}: is a file"])
@@ -282,7 +283,9 @@ def _task(container: dict[str, Any]) -> None:
         _check_grid(settings)
     subject = _of_grid(settings, conditions.controller) if grid_too else None
     if subject:
-        writable_file(subject[2])
+        out = subject[2]
+        writable_file(out)
+        note_replaced(out.parent, [out.name, out.with_suffix(".parquet").name], "out=FILE")
     if protocols:
         _protocols(settings, protocols, conditions)
     if subject:
@@ -311,6 +314,7 @@ def _grid(
     settings: Any, measures: list[Term], conditions: _Conditions, run: Path, checkpoint: Path | None, out: Path
 ) -> None:
     """Play the grid of constant commands."""
+    show = spinner(1, "evaluating")
     from go1exp.evaluate import criteria, rows, table
     from go1exp.evaluate.rollout import EvalConfig, delay_margin, evaluate, grid
     from go1exp.train.policy import load_run
@@ -329,7 +333,7 @@ def _grid(
     report = {
         "policy": about,
         "robot": subjects.robot_as_data(conditions.other),
-        **evaluate(task, policy, config, spinner(1, "evaluating"), measures, make),
+        **evaluate(task, policy, config, show, measures, make),
     }
     if settings.delay_margin:
         falls = report["distinct_falls"]

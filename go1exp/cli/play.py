@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from go1exp.base import memory
 from go1exp.cli import subjects
-from go1exp.cli.app import App, parse, spinner
+from go1exp.cli.app import App, announce, parse, spinner
 from go1exp.cli.evaluate import writable_file
 from go1exp.cli.play_web import PlaySettings, address, log, walk
 from go1exp.cli.subjects import agent
@@ -51,6 +51,7 @@ def _task(container: dict[str, Any]) -> None:
     live = settings.viewer == "live" or (settings.viewer == "auto" and has_display)
     if not live:
         writable_file(out)
+        announce("recording a video")
 
     from go1exp.evaluate.rollout import EvalConfig, evaluation_task, require_agreement
     from go1exp.sim.env.core import Go1Core

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -40,7 +41,8 @@ def _task(container: dict[str, Any]) -> int:
     server = Server(Robot(body, config), config, where[1], where[0])
     print(greeting(settings.start, server.address), flush=True)
     try:
-        serve(server, lambda: True, partial(print, flush=True), settings.seconds)
+        with suppress(KeyboardInterrupt):  # its usual end
+            serve(server, lambda: True, partial(print, flush=True), settings.seconds)
     finally:
         server.close()
     return 0

@@ -217,7 +217,7 @@ class _Watch:
         self.write()
         done = sum(job.state == "done" for job in now.jobs)
         for job in new:
-            print(f"{done}/{len(now.jobs)} done  {job.state:8} {job.name or job.run_folder}", flush=True)
+            print(f"[{done}/{len(now.jobs)} done] {job.state:8} {job.name or job.run_folder}", flush=True)
 
     def write(self) -> None:
         """Write the index; where that fails, the run folders know the same."""

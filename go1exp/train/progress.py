@@ -55,7 +55,7 @@ class Progress:
         parts = [f"{rate:,.0f} steps/s"]
         for key, label, form in (
             ("rollout/return", "return", "{:.2f}"),
-            ("rollout/length", "length", "{:.0f}"),
+            ("rollout/length", "length", "{:.0f} steps"),
             ("train/kl", "KL", "{:.4f}"),
             ("train/learning_rate", "lr", "{:.1e}"),
             ("curriculum/terrain_level", "terrain", "{:.2f}"),
@@ -68,4 +68,9 @@ class Progress:
         elif elapsed - self._printed >= LINE_PERIOD or iteration == self._last:
             self._printed = elapsed
             left = (self._last - iteration) * elapsed / max(iteration - self._first, 1)
-            print(f"iteration {iteration}/{self._last}  {text}  {left / 60:.1f} min left", file=sys.stderr, flush=True)
+            print(f"iteration {iteration}/{self._last}  {text}  {duration(left)} left", file=sys.stderr, flush=True)
+
+
+def duration(seconds: float) -> str:
+    """Return a duration as text, in seconds below two minutes."""
+    return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.1f} min"

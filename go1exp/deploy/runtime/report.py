@@ -141,7 +141,8 @@ def end_line(outcome: Outcome) -> str:
     """Return a line on the end of a walk; a fault with its time since the first cycle."""
     if fault := outcome.fault:
         began = min(outcome.log.phases.values(), default=fault.t)
-        return f"fault: {fault.name} at {fault.t - began:.3f} s after the start: {fault.message}"
+        hint = "; a busy machine, and a simulated robot? stale=0.2" if fault.name == "stale_state" else ""
+        return f"fault: {fault.name} at {fault.t - began:.3f} s after the start: {fault.message}{hint}"
     end = f"stopped by {outcome.requested_by}" if outcome.requested_by else "to the end"
     return f"walked for {outcome.walked:.1f} s, {end}"
 

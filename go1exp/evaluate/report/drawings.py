@@ -90,9 +90,7 @@ def _limits(middles: Sequence[Any], bounds: Sequence[Any]) -> tuple[float, float
     return max(low - room, float(every.min()) - 0.05 * room), min(high + room, float(every.max()) + 0.05 * room)
 
 
-def forests(
-    figures: Sequence[Figure], main: Sequence[str], baseline: str, key: str, of_groups: Looks
-) -> list[Drawing]:
+def forests(figures: Sequence[Figure], main: Sequence[str], baseline: str, key: str, of_groups: Looks) -> list[Drawing]:
     """Return one drawing for each main quantity: groups from top to bottom with their intervals."""
     drawings = []
     for name in main:

@@ -12,6 +12,7 @@ from typing import Any
 
 import yaml
 
+from go1exp.base.wording import counted
 from go1exp.config.schema.registry import ConfigError
 from go1exp.train import run_state
 
@@ -240,7 +241,10 @@ def groups(study: Study) -> list[Group]:
     single = [g.name for g in made if len(g.runs) == 1]
     if single:
         listed = ", ".join(single[:4]) + (", ..." if len(single) > 4 else "")
-        study.notes.append(f"{len(single)} groups have one run, so the spread over seeds is unknown: {listed}")
+        have = "has" if len(single) == 1 else "have"
+        study.notes.append(
+            f"{counted(len(single), 'group')} {have} one run, so the spread over seeds is unknown: {listed}"
+        )
     return made
 
 

@@ -60,7 +60,7 @@ def tables(made: Report) -> list[Table]:
 def about_baseline(made: Report) -> str:
     """Return which group is the baseline, and how it was chosen."""
     name, most = made.baseline.name, max(len(g.runs) for g in made.groups)
-    if made.settings["baseline"] is not None or len(made.groups) == 1:
+    if made.settings.get("baseline") is not None or len(made.groups) == 1:
         return f"baseline: {name}"
     equal = sum(len(g.runs) == most for g in made.groups)
     rule = "the group with most runs" if equal == 1 else f"the first of {equal} groups with most runs"

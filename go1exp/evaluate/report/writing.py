@@ -44,7 +44,7 @@ def page(made: Report) -> str:
             title=f"report: {names}",
             kind="go1exp report",
             heading=names,
-            lead=f"{count} runs in {len(made.groups)} groups; {about_baseline(made)}.",
+            lead=f"{counted(count, 'run')} in {counted(len(made.groups), 'group')}; {about_baseline(made)}.",
             verdicts=_head(made),
             facts=[*([f"{counted(excluded, 'run')} excluded, listed below."] * bool(excluded)), *made.study.notes],
             sections=[

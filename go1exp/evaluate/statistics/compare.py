@@ -220,9 +220,13 @@ def verdict_by_p(estimate: float, p: float, better: Direction, alpha: float = AL
     return "better" if (estimate > 0.0) == (better == "higher") else "worse"
 
 
+FEWEST_PAIRS = 3
+"""Pairs from which a difference may be significant: the spread of two is hardly known."""
+
+
 def verdict_by_interval(between: Interval, better: Direction) -> Word:
-    """Return the verdict on a difference, other - first, by whether its interval excludes zero."""
-    if not (math.isfinite(between.low) and math.isfinite(between.high)):
+    """Return the verdict on a difference, other - first, by whether its interval excludes zero; none from two pairs."""
+    if between.n < FEWEST_PAIRS or not (math.isfinite(between.low) and math.isfinite(between.high)):
         return "no significant difference"
     if between.low > 0.0 or between.high < 0.0:
         return "better" if (between.low > 0.0) == (better == "higher") else "worse"

@@ -14,6 +14,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from scipy.signal import savgol_filter
 
+from go1exp.base.wording import counted
 from go1exp.config.schema.registry import unknown_name
 from go1exp.gap.actuator_net.settings import FitError
 from go1exp.logs.recording import Recording, as_json
@@ -245,8 +246,9 @@ def split(
     rest = [name for name in names if name not in set().union(*chosen.values())]
     if not (rest and chosen["holdout"] and chosen["validation"]):
         raise FitError(
-            f"{len(names)} episodes in {len(clusters)} groups of repeats cannot be split into training, validation and "
-            "held-out ones; record at least three that repeat no other, or name fewer for holdout and validation"
+            f"{counted(len(names), 'episode')} in {counted(len(clusters), 'group')} of repeats cannot be split into"
+            " training, validation and held-out ones; record at least three that repeat no other, or name fewer for"
+            " holdout and validation"
         )
     return Split(
         tuple(rest),

@@ -165,18 +165,24 @@ def _rows(curve: Mapping[str, Any]) -> Figure:
     return figure
 
 
+LOOKS = (("o", "-"), ("s", "--"), ("^", ":"), ("D", "-."))
+"""Marker and line style of each amplitude; colours are the subjects'."""
+
+
 def _bode(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
     figure, axes = plots.panels(3, 2, sharex=True)
     lines = [(who, a) for who, s in summaries.items() for a in dict.fromkeys(e["condition"]["amplitude"] for e in s)]
+    amplitudes = list(dict.fromkeys(amplitude for _, amplitude in lines))
     for k, (who, amplitude) in enumerate(lines):
         entries = [e for e in summaries[who] if e["condition"]["amplitude"] == amplitude]
         entries.sort(key=lambda e: -e["condition"]["period"])
         colour = plots.COLOURS[(list(summaries).index(who) if len(summaries) > 1 else k) % len(plots.COLOURS)]
+        look = dict(zip(("marker", "ls"), LOOKS[amplitudes.index(amplitude) % len(LOOKS)], strict=True))
         frequency = [(1.0 + 0.012 * k) / e["condition"]["period"] for e in entries]
         for a, axis in enumerate(AXES):
             text = f"{who} {amplitude}".strip() if a == 0 else ""
-            plots.intervals(axes[a, 0], frequency, entries, f"gain_{axis}", colour, text)
-            plots.intervals(axes[a, 1], frequency, entries, f"lag_{axis}", colour, "")
+            plots.intervals(axes[a, 0], frequency, entries, f"gain_{axis}", colour, text, **look)
+            plots.intervals(axes[a, 1], frequency, entries, f"lag_{axis}", colour, "", **look)
     for a, axis in enumerate(AXES):
         axes[a, 0].set_ylabel(f"{axis}: gain")
         axes[a, 1].set_ylabel("lag (s)")

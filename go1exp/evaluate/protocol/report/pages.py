@@ -32,15 +32,15 @@ INTERVALS = (
 
 VERDICTS = (
     "better, worse: the 95 % interval of the difference, in brackets, excludes zero; no significant difference: the"
-    " interval includes zero. n: number of pairs, robots with a value for both. Pairs needed: sample size for 80 %"
-    " power."
+    " interval includes zero, or there are fewer than three pairs. n: number of pairs, robots with a value for both."
+    " Pairs needed: sample size for 80 % power."
 )
 
 PAIRING = (
     "All subjects play the same protocol with the same seed and the same randomisation, robot by robot. Difference ="
     " other - first, over robots with a value for both; walking quantities exclude robots that fell with either.",
-    "Intervals of 95 %: bootstrap over robots; shares by Agresti and Min. One in twenty equal quantities is expected to"
-    " differ significantly by chance.",
+    "Intervals of 95 %: Student's over robots; shares by Agresti and Min; figures of all robots together by the"
+    " bootstrap. One in twenty equal quantities is expected to differ significantly by chance.",
 )
 
 

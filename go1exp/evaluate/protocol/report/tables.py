@@ -12,6 +12,7 @@ from go1exp.base.wording import counted
 from go1exp.evaluate.protocol.claims import limits
 from go1exp.evaluate.protocol.ground import UNITS
 from go1exp.evaluate.protocol.playing import Result
+from go1exp.evaluate.quantities import ROBOT
 
 Entry = Mapping[str, Any]
 Meanings = Mapping[str, tuple[str, str]]
@@ -68,7 +69,9 @@ def falls(result: Result) -> str:
     rows = result.played.rows
     minutes = sum(row["moving_s"] for row in rows) / 60.0
     count, left = (sum(bool(row[k]) for row in rows) for k in ("fell", "left_map"))
-    return f"{counted(count, 'fall')}, {left} left the map, in {minutes:.1f} moving robot-minutes ({len(rows)} rows)."
+    text = f"{counted(count, 'fall')}, {left} left the map, in {minutes:.1f} moving robot-minutes ({len(rows)} rows)"
+    down = len({row[ROBOT] for row in rows} - {row[ROBOT] for row in rows if row["fell"] is not None})
+    return text + (f"; {counted(down, 'robot')} fell before anything counted." if down else ".")
 
 
 # ---------------------------------------------------------------------- tables
