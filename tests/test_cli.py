@@ -492,7 +492,7 @@ def test_a_recording_is_made_imported_audited_and_refused(tmp_path: Path) -> Non
     quick = ("seconds=1.0", "physics_dt=0.002", "backend.threads=1", "excitation=[gait]", "out=logs")
     done = cli(tmp_path, "record", *quick)
     assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
+    assert done.stderr == "recording 1 episodes ...\n"
     assert done.stdout.startswith("1 recording, 1 s, in logs\n")
     (file,) = (tmp_path / "logs").iterdir()
     done = cli(tmp_path, "record", "audit", f"logs/{file.name}", "out=audit/found.json")
@@ -536,7 +536,7 @@ GRID = ("grid.x=[0.5]", "grid.y=[]", "grid.yaw=[]", "episodes=2", "duration_s=0.
 def test_eval_prints_a_table_and_writes_the_same_as_json(run: Path, tmp_path: Path) -> None:
     done = cli(tmp_path, "eval", f"run={run}", *GRID, "out=sub/report.json")
     assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
+    assert done.stderr == "evaluating ...\n"
     report: dict[str, Any] = json.loads((tmp_path / "sub/report.json").read_text())
     assert set(report) >= {"policy", "commands", "rmse", "falls", "episodes", "settings"}
     assert report["policy"]["iteration"] == 2
