@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from subprocess import CompletedProcess
 from typing import Any
@@ -81,7 +82,7 @@ def test_gymnasium_makes_it_by_name_with_overrides(registered: None) -> None:
     try:
         assert isinstance(env.unwrapped, Go1Env)
         assert env.observation_space == gymnasium.spaces.Box(-np.inf, np.inf, (48,), np.float32)
-        assert env.action_space == gymnasium.spaces.Box(-3.0, 3.0, (12,), np.float32)
+        assert env.action_space == gymnasium.spaces.Box(-2.0, 2.0, (12,), np.float32)
         assert env.metadata["render_fps"] == 50
         observation, info = env.reset(seed=1)
         assert env.observation_space.contains(observation)
@@ -94,6 +95,79 @@ def test_gymnasium_makes_it_by_name_with_overrides(registered: None) -> None:
             assert (terminated, truncated) == (False, k == 5)
     finally:
         env.close()
+
+
+def test_the_action_box_is_chosen_and_ends_at_the_clip(make_core: Make) -> None:
+    assert Go1Env(QUIET, action_box=0.5).action_space == gymnasium.spaces.Box(-0.5, 0.5, (12,), np.float32)
+    assert Go1Env([*QUIET, "action.clip=1.0"]).action_space.high.tolist() == [1.0] * 12
+    assert Go1VecEnv(make_core(*QUIET), action_box=3.0).action_space.high.tolist() == [3.0] * 12
+    with pytest.raises(ConfigError, match=r"^action_box = 0.0: must be positive"):
+        Go1Env(QUIET, action_box=0.0)
+
+
+def test_actions_drawn_uniformly_from_the_box_leave_the_robot_standing() -> None:
+    env = Go1Env([*QUIET[:-2], "command=forward"])
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    assert not any(env.step(env.action_space.sample())[2] for _ in range(100))
+
+
+ASYNC = """
+import gymnasium
+env = gymnasium.make_vec("go1exp.sim.gym:Go1-v0", num_envs=2, vectorization_mode="async", overrides=["terrain=flat"])
+env.reset(seed=0)
+print(env.step(0.0 * env.action_space.sample())[0].shape)
+env.close()
+"""
+
+
+@alone
+def test_gymnasiums_asynchronous_vector_works_with_its_default_fork(tmp_path: Path) -> None:
+    """In a process of its own: what hangs is a fork after torch has started threads."""
+    done = run_alone(tmp_path, code=ASYNC)
+    assert done.stdout.strip() == "(2, 48)", done.stderr
+
+
+def test_gymnasiums_vector_of_robots_is_the_batch(registered: None) -> None:
+    env = gymnasium.make_vec("Go1-v0", num_envs=3, overrides=LIVELY)
+    core = go1exp.make(LIVELY, 3, seed=4)
+    assert env.action_space.shape == (3, 12)
+    np.testing.assert_array_equal(env.reset(seed=4)[0], core.reset().numpy())
+    ended = 0
+    for action in actions(3, 25):
+        observation, reward, terminated, truncated, info = env.step(action)
+        expected = core.step(torch.as_tensor(action))
+        np.testing.assert_array_equal(observation, expected.observation.numpy())
+        np.testing.assert_array_equal(reward, expected.reward.numpy())
+        done = terminated | truncated
+        ended += done.sum()
+        assert bool(info) == done.any()
+        if info:
+            np.testing.assert_array_equal(info["_final_obs"], done)
+            np.testing.assert_array_equal(info["final_obs"][done], expected.final_observation.numpy()[done])
+    assert ended >= 3
+
+
+def test_an_action_that_is_not_finite_is_refused_by_a_batch_and_leaves_no_file(
+    make_core: Make, elsewhere: None
+) -> None:
+    core = make_core(*QUIET, num_envs=3)
+    core.reset()
+    action = torch.zeros(3, 12)
+    action[1, 0] = torch.inf
+    with pytest.raises(NumericalFault, match="^action is not finite in environment 1 at step 1$"):
+        core.step(action)
+    core.backend.qvel[0, 3] = torch.inf
+    with pytest.raises(NumericalFault):
+        core.check(core.step(torch.zeros(3, 12)))
+    assert list(Path().iterdir()) == []
+
+
+@pytest.mark.parametrize("group", ["reward", "rand", "terrain", "event"])
+def test_make_refuses_a_choice_as_the_command_line_does(group: str, registered: None) -> None:
+    for make in (go1exp.make, partial(gymnasium.make, "Go1-v0")):
+        with pytest.raises(ConfigError, match=f"^{group}=nonee: unknown choice of {group} 'nonee'; "):
+            make(overrides=[f"{group}=nonee"])
 
 
 def test_the_render_rate_is_that_of_the_policy() -> None:

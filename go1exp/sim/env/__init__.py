@@ -8,5 +8,6 @@ def register() -> None:
     """
     import gymnasium
 
+    module = "go1exp.sim.env.gym_env"
     if "Go1-v0" not in gymnasium.registry:
-        gymnasium.register(id="Go1-v0", entry_point="go1exp.sim.env.gym_env:Go1Env")
+        gymnasium.register("Go1-v0", entry_point=f"{module}:Go1Env", vector_entry_point=f"{module}:Go1VectorEnv")

@@ -8,7 +8,7 @@ from typing import Any
 
 from go1exp.config.schema.registry import ConfigError
 from go1exp.sim.env.core import Go1Core
-from go1exp.sim.task import parse_task
+from go1exp.sim.task import TaskConfig, parse_task
 
 
 def make(
@@ -34,11 +34,15 @@ def make(
     Raises:
         go1exp.config.schema.registry.ConfigError: if an override, a number of robots or a seed is invalid.
     """
-    from go1exp.config.compose import compose
-
     num_envs, seed = whole("num_envs", num_envs, 1), whole("seed", seed, 0)
-    task = parse_task(compose("train", listed(overrides)))
-    return Go1Core(task, num_envs, seed, noise=noise, spread_starts=spread_starts)
+    return Go1Core(task_of(overrides), num_envs, seed, noise=noise, spread_starts=spread_starts)
+
+
+def task_of(overrides: Any) -> TaskConfig:
+    """Return the task of ``go1exp train`` with overrides; raise ConfigError, as the command line does."""
+    from go1exp.config.compose import compose_checked
+
+    return parse_task(compose_checked("train", listed(overrides)))
 
 
 def whole(name: str, value: Any, least: int) -> int:

@@ -224,7 +224,13 @@ class Go1Core:
 
         Order: physics, failure and time limit, reward, last observation, resets of ended episodes, new commands,
         pushes, first observation. A push and a new command are therefore seen before they are answered.
+
+        Raises:
+            NumericalFault: if an action is not finite, before it is applied. On a GPU ``check_so_far`` raises it.
         """
+        if not self._deferred and not torch.isfinite(action).all():
+            state = {"qpos": self.backend.qpos, "qvel": self.backend.qvel}
+            accuse({"action": of_shape(action, self.action.shape), **state}, self.steps + 1)
         if not self.captures:
             return self.step_by_call(action)
         if self._captured is None:

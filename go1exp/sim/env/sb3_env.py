@@ -12,13 +12,24 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from go1exp import robot
+from go1exp.config.schema.registry import ConfigError
 from go1exp.mdp.types import StepResult
 from go1exp.sim.env.core import Go1Core
 
 
-def spaces(core: Go1Core) -> tuple[gym.spaces.Box, gym.spaces.Box]:
-    """Return the observation and action space of one environment."""
-    clip = core.task.action.clip
+def spaces(core: Go1Core, action_box: float | None = None) -> tuple[gym.spaces.Box, gym.spaces.Box]:
+    """Return the observation and action space of one environment.
+
+    Args:
+        core: the environment.
+        action_box: the action space is +-``action_box``, at most ``action.clip``, which is meant by None.
+
+    Raises:
+        ConfigError: if ``action_box`` is not positive.
+    """
+    clip = core.task.action.clip if action_box is None else min(action_box, core.task.action.clip)
+    if not clip > 0.0:
+        raise ConfigError([f"action_box = {action_box}: must be positive, in units of action.scale"])
     return (
         gym.spaces.Box(-np.inf, np.inf, (core.observation_size,), np.float32),
         gym.spaces.Box(-clip, clip, (robot.NUM_JOINTS,), np.float32),
@@ -31,13 +42,17 @@ class Go1VecEnv(VecEnv):
     An info is filled only for episodes that ended: ``terminal_observation``, ``TimeLimit.truncated`` and ``episode``
     with return ``r`` and length ``l`` in steps.
 
+    Args:
+        core: the environments.
+        action_box: bound of the action space; None is ``action.clip``. Off-policy learners explore all of it.
+
     Raises:
-        NumericalFault: from ``step`` when a state, torque, reward or observation is not finite.
+        NumericalFault: from ``step`` when an action, state, reward or observation is not finite.
     """
 
-    def __init__(self, core: Go1Core) -> None:
+    def __init__(self, core: Go1Core, action_box: float | None = None) -> None:
         self.core = core
-        super().__init__(core.num_envs, *spaces(core))
+        super().__init__(core.num_envs, *spaces(core, action_box))
         self._actions = torch.zeros_like(core.action)
 
     def reset(self) -> VecEnvObs:

@@ -23,6 +23,11 @@ DERIVED = "dof_M0"
 """A field that robots have of their own once constants have been derived from their models."""
 
 
+_log = mujoco.MjLogConfig.get()
+_log.logto_file = False  # MuJoCo would leave MUJOCO_LOG.TXT in the working folder
+_log.set()
+
+
 class MujocoCpu:
     """N simulations on ``threads`` threads; the same bits whatever their number (see ``PhysicsBackend``)."""
 
