@@ -479,7 +479,8 @@ def test_a_trace_is_never_unpickled(good: Bundle, members: dict[str, bytes]) -> 
         ({"inputs": [{"name": "joint_pos"}]}, "inputs.0.size: missing"),
         ({"trained": None}, "trained.: must be a mapping"),
         ({"odd": 1}, "odd: unknown key"),
-        ({"kp": [20.0] * 11 + [-5.0]}, "kp.11 = -5: must be at least 0, as the gain of RL_calf"),
+        ({"kp": [20.0] * 11 + [-5.0]}, "kp.11 = -5: must be 0 to 1023, as the gain of RL_calf"),
+        ({"kp": [1e9] + [20.0] * 11}, "kp.0 = 1e+09: must be 0 to 1023, as the gain of FR_hip"),
         ({"torque_limit": [0.0] * 12}, "torque_limit.0 = 0: must be greater than 0, as the limit of FR_hip"),
         ({"joint_limits": [[1.0, -1.0]] * 12}, "joint_limits.0: the lower stop of FR_hip, 1, is not below -1"),
         ({"joints": ["FR_hip"] * 12}, "joints: FR_hip duplicate"),
@@ -498,6 +499,7 @@ def test_wrong_metadata_are_refused_by_key(change: dict[str, Any], message: str,
 @pytest.mark.parametrize("name", ["metadata.json", "config.json", "versions.json"])
 def test_what_is_no_json_is_refused(name: str, members: dict[str, bytes]) -> None:
     assert refused(pack({**members, name: b"{"})).startswith(f"{name}: invalid JSON")
+    assert refused(pack({**members, name: b"[" * 100_000})).startswith(f"{name}: invalid JSON")
     assert f"{name}: " in refused(pack({**members, name: b"[]"}))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import json
 import re
@@ -97,7 +98,8 @@ def test_a_bundle_plays_what_its_run_plays(run: Path, bundle: Path, tmp_path: Pa
     theirs, about_bundle = evaluated(tmp_path / "bundle", f"bundle={bundle}", quiet)
     for a, b in zip(ours, theirs, strict=True):
         assert a["rmse_x"] == pytest.approx(b["rmse_x"], abs=1e-3)
-    assert about_bundle["agent"]["sha256"] != about["agent"].get("sha256")
+    assert about_bundle["agent"]["sha256"] == hashlib.sha256(bundle.read_bytes()).hexdigest()
+    assert about_bundle["agent"]["trained"]["iteration"] == about["agent"]["iteration"]
     noisy, _ = evaluated(tmp_path / "noisy", f"bundle={bundle}")
     assert [r["rmse_x"] for r in noisy] != [r["rmse_x"] for r in theirs]
 

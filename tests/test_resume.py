@@ -313,6 +313,26 @@ def test_a_finished_run_is_extended_as_if_it_had_been_meant_to_be_longer(flat: P
 # ---------------------------------------------------------------------- damaged checkpoints
 
 
+def test_a_changed_bit_of_a_tensor_is_damage(killed_copy: Path) -> None:
+    newest = killed_copy / "checkpoints/000004.pt"
+    changed = bytearray(newest.read_bytes())
+    weight = checkpoint.read(newest)["policy"]["mlp_extractor.policy_net.0.weight"].numpy().tobytes()
+    changed[changed.index(weight) + 100] ^= 1
+    newest.write_bytes(changed)
+    with pytest.raises(checkpoint.DamagedCheckpoint, match=r"000004\.pt: damaged"):
+        checkpoint.read(newest)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"plugins": 3}', '{"plugins": [{}]}'])
+def test_a_damaged_meta_json_is_refused_with_its_name(text: str, killed_copy: Path, tmp_path: Path) -> None:
+    (killed_copy / "meta.json").write_text(text)
+    for words in (("train", f"resume={killed_copy}"), ("eval", f"run={killed_copy}")):
+        done = cli(tmp_path, *words)
+        assert done.returncode == 2, done.stderr
+        assert "Traceback" not in done.stderr
+        assert f"{killed_copy}/meta.json: damaged; it must be JSON" in done.stderr
+
+
 @pytest.mark.parametrize("damage", ["truncated", "empty", "overwritten"])
 def test_a_damaged_checkpoint_is_passed_over_with_a_warning(damage: str, flat: Path, killed_copy: Path) -> None:
     newest = killed_copy / "checkpoints/000004.pt"

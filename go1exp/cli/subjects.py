@@ -280,7 +280,8 @@ def agent(subject: Named, other: dict[str, Any], robot_of: TaskConfig | None = N
 
         bundle = load(subject.bundle)
         task = _robot(parse_train(bundle.config).task, other, robot_of)
-        about = {"bundle": str(subject.bundle), "sha256": bundle.seal, **dataclasses.asdict(bundle.metadata.trained)}
+        trained = dataclasses.asdict(bundle.metadata.trained)
+        about = {"bundle": str(subject.bundle), "sha256": bundle.seal, "trained": trained}
         return BundleAgent(subject.label, task, bundle, about)
     assert subject.run is not None
     if subject.controller is not None:

@@ -9,6 +9,7 @@ import errno
 import io
 import random
 import warnings
+import zipfile
 from collections import deque
 from pathlib import Path
 from typing import Any
@@ -96,6 +97,10 @@ def read(path: Path) -> dict[str, Any]:
     """
     data = io.BytesIO(path.read_bytes())  # first: torch's reader has an OSError for a file that is cut off, too
     try:
+        with zipfile.ZipFile(data) as archive:  # torch does not compare the sums of its members
+            if archive.testzip():
+                raise zipfile.BadZipFile
+        data.seek(0)
         state: Any = torch.load(data, map_location="cpu", weights_only=True)
     except Exception:  # in many ways, and torch's own words advise to run the code that the file may hold
         raise DamagedCheckpoint(f"{path}: damaged checkpoint (not whole, or not written by go1exp)") from None

@@ -234,7 +234,13 @@ def _records(run: Path) -> list[dict[str, Any]]:
     file = run / "meta.json"
     if not file.is_file():
         return []
-    records: list[dict[str, Any]] = json.loads(file.read_text()).get("plugins", [])
+    try:
+        content = json.loads(file.read_text())
+        records: list[dict[str, Any]] = content.get("plugins", [])
+        if not all({"name", "file", "sha256"} <= r.keys() or {"name", "version"} <= r.keys() for r in records):
+            raise TypeError
+    except (ValueError, AttributeError, TypeError, RecursionError):
+        raise ConfigError([f"{file}: damaged; it must be JSON whose plugins are a list of records"]) from None
     return records
 
 

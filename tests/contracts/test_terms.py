@@ -287,6 +287,8 @@ def test_state_terms_add_uniform_draws_of_table_i() -> None:
         assert (values.mean(0).abs() < 0.06 * half).all()
         assert (np.abs(np.corrcoef(values.numpy().T) - np.eye(columns)) < 0.1).all()
     assert (state.base_pos_w[:, 2] == 0.33).all()
+    velocities = torch.cat((state.base_lin_vel_w, state.base_ang_vel_b), 1).numpy()
+    assert (np.abs(np.corrcoef(velocities.T) - np.eye(6)) < 0.1).all()  # turning is drawn by itself
 
 
 def test_joint_positions_scale_or_shift_the_stance_and_stop_at_the_hard_limits() -> None:
@@ -298,8 +300,10 @@ def test_joint_positions_scale_or_shift_the_stance_and_stop_at_the_hard_limits()
     inside = (scaled.joint_pos > -2.818) & (scaled.joint_pos < -0.888) | (nominal > -1.0)
     assert factor[inside].min() >= 0.7 - 1e-6
     assert factor[inside].max() <= 1.3 + 1e-6
+    assert factor[inside].min() < 0.71
+    assert factor[inside].max() > 1.29
     term(shifted, stream(n), operation="add")
-    assert (shifted.joint_pos - nominal).abs().max() <= 0.3 + 1e-6
+    assert 0.29 < (shifted.joint_pos - nominal).abs().max() <= 0.3 + 1e-6
     term(wild, stream(n), range=(-9.0, 9.0), operation="add")
     low, high = torch.as_tensor(robot.JOINT_POS_LIMITS).unbind(1)
     assert ((wild.joint_pos >= low) & (wild.joint_pos <= high)).all()

@@ -117,11 +117,8 @@ def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, source: str) -> byt
 
 def _hashes(manifest: bytes, members: tuple[str, ...], source: str) -> dict[str, str]:
     """Return the hashes of the manifest, which must have exactly these keys."""
-    try:
-        content = json.loads(manifest)
-    except ValueError as error:
-        raise BundleError(f"{source}: {MANIFEST}: invalid JSON ({error})") from None
-    if not isinstance(content, dict) or content.keys() != {"format", "sha256"}:
+    content = _json(manifest, f"{source}: {MANIFEST}")
+    if content.keys() != {"format", "sha256"}:
         raise BundleError(f"{source}: {MANIFEST}: must have format and sha256 alone")
     if content["format"] != FORMAT:
         raise BundleError(f"{source}: {MANIFEST}: format {content['format']!r}, this version reads {FORMAT}")
@@ -259,7 +256,7 @@ def _metadata(content: bytes, source: str) -> Metadata:
 def _json(content: bytes, where: str) -> dict[str, Any]:
     try:
         document = json.loads(content)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise BundleError(f"{where}: invalid JSON ({error})") from None
     if not isinstance(document, dict):
         raise BundleError(f"{where}: must be a mapping")

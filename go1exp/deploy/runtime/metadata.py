@@ -13,6 +13,9 @@ from go1exp.deploy.runtime.commands import AXES
 
 T = TypeVar("T")
 
+MAX_GAIN = 1023.0
+"""Largest gain that the Go1's packets carry, N m/rad and N m s/rad."""
+
 
 @dataclass(frozen=True)
 class Port:
@@ -135,8 +138,9 @@ class Metadata:
             raise ValueError(f"joints: {', '.join(sorted(twice))} duplicate")
         for name in ("kp", "kd"):
             for k, value in enumerate(getattr(self, name) or ()):
-                if value < 0:
-                    raise ValueError(f"{name}.{k} = {value:g}: must be at least 0, as the gain of {self.joints[k]}")
+                if not 0 <= value <= MAX_GAIN:
+                    limits = f"must be 0 to {MAX_GAIN:g}"
+                    raise ValueError(f"{name}.{k} = {value:g}: {limits}, as the gain of {self.joints[k]}")
         for name in ("torque_limit", "velocity_limit"):
             for k, value in enumerate(getattr(self, name)):
                 if value <= 0:

@@ -15,7 +15,6 @@ from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.sb3_env import spaces
 from go1exp.sim.task import TaskConfig
 
-
 ACTION_BOX = 2.0
 """Default bound of the action space, in units of ``action.scale``: 0.4 rad about the nominal stance by default.
 
@@ -138,7 +137,7 @@ class Go1VectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:  # type: ignore[override]
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """Start all episodes anew; a seed makes them and all that follow reproducible."""
         if seed is not None:
             self.core.reseed(seed)
