@@ -224,13 +224,10 @@ class Go1Core:
 
         Order: physics, failure and time limit, reward, last observation, resets of ended episodes, new commands,
         pushes, first observation. A push and a new command are therefore seen before they are answered.
-
-        Raises:
-            NumericalFault: if an action is not finite, before it is applied. On a GPU ``check_so_far`` raises it.
+        On a CPU an action that is not finite raises NumericalFault first.
         """
         if not self._deferred and not torch.isfinite(action).all():
-            state = {"qpos": self.backend.qpos, "qvel": self.backend.qvel}
-            accuse({"action": of_shape(action, self.action.shape), **state}, self.steps + 1)
+            accuse({"action": of_shape(action, self.action.shape), "qpos": self.backend.qpos}, self.steps + 1)
         if not self.captures:
             return self.step_by_call(action)
         if self._captured is None:
@@ -368,8 +365,8 @@ class Go1Core:
     def _suspects(self, observation: Tensor) -> dict[str, Tensor]:
         """What may not be finite after a step, causes first."""
         named = {"action": self._last_action, "qpos": self._last_qpos, "qvel": self._last_qvel}
-        named |= {f"reward.{t.key}": self.terms.values[:, k] for k, t in enumerate(self.terms.rewards)}
-        return {**named, "observation": observation}
+        rewards = {f"reward.{t.key}": self.terms.values[:, k] for k, t in enumerate(self.terms.rewards)}
+        return {**named, **rewards, "observation": observation}
 
     def drain_metrics(self, steps: int) -> dict[str, float]:
         """Return means since the last call, ``steps`` policy steps ago: reward terms per second, the level, ..."""
