@@ -106,8 +106,8 @@ class Go1Core:
         self.task_log = TaskLog(time.policy_dt, self.device)
         self._touched, self._calf_touched = map(torch.zeros_like, (self._link_contacts, self._foot_contact[..., 0]))
         self._nominal = torch.as_tensor(robot.NOMINAL_STANCE, dtype=torch.float32, device=self.device)
-        self._started, self._evidence, self.captures = False, Evidence(), task.backend.captures
-        self._deferred = self.device.type == "cuda"  # where to look at a value is to wait for it
+        self._started, self._deferred = False, self.device.type == "cuda"  # where to look at a value is to wait for it
+        self._evidence, self.captures = Evidence(), task.backend.captures
         self._captured: CapturedStep | None = None
 
     def _build_ground(self, first_env: int) -> None:
@@ -224,7 +224,6 @@ class Go1Core:
 
         Order: physics, failure and time limit, reward, last observation, resets of ended episodes, new commands,
         pushes, first observation. A push and a new command are therefore seen before they are answered.
-        On a CPU an action that is not finite raises NumericalFault first.
         """
         if not self._deferred and not torch.isfinite(action).all():
             accuse({"action": of_shape(action, self.action.shape), "qpos": self.backend.qpos}, self.steps + 1)
@@ -308,8 +307,8 @@ class Go1Core:
 
     def snapshot(self) -> Snapshot:
         """Return the present moment as the MDP sees it; staleness of sensors as in ``sim/physics/backend.py``."""
-        state, foot_pos = self._state, self._foot_pos_w.float()
-        quat = state.base_quat_w.float()
+        state = self._state
+        quat, foot_pos = state.base_quat_w.float(), self._foot_pos_w.float()
         return Snapshot(
             base_pos_w=state.base_pos_w.float(),
             base_quat_w=quat,
