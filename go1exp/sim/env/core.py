@@ -95,19 +95,17 @@ class Go1Core:
         self._build_terms(actuators)
         self._restarts = Restarts(self._restart, (self.random, actuators))
         zeros = partial(torch.zeros, num_envs, dtype=torch.float32, device=self.device)
-        self.action, self.previous_action = zeros(robot.NUM_JOINTS), zeros(robot.NUM_JOINTS)
-        self._last_action, self.target = zeros(robot.NUM_JOINTS), zeros(robot.NUM_JOINTS)
-        self.joint_acc, self.spawn = zeros(robot.NUM_JOINTS), zeros(3)
+        joint_values = (zeros(robot.NUM_JOINTS) for _ in range(5))
+        self.action, self.previous_action, self._last_action, self.target, self.joint_acc = joint_values
         self.steps, self._first_step, self.episode_return = *(zeros(dtype=torch.int64) for _ in range(2)), zeros()
         self._last_qpos, self._last_qvel = torch.zeros_like(self.backend.qpos), torch.zeros_like(self.backend.qvel)
-        self.reward_sums = self.terms.sums
-        self.feet, self.path = Feet(num_envs, task.sim.physics_dt, self.device), TrackedPath(num_envs, self.device)
+        self.reward_sums, self.spawn, self.path = self.terms.sums, zeros(3), TrackedPath(num_envs, self.device)
+        self.feet, self.task_log = Feet(num_envs, time.physics_dt, self.device), TaskLog(time.policy_dt, self.device)
         self.gait_log = GaitLog(num_envs, time.policy_dt, self.device)
-        self.task_log = TaskLog(time.policy_dt, self.device)
         self._touched, self._calf_touched = map(torch.zeros_like, (self._link_contacts, self._foot_contact[..., 0]))
         self._nominal = torch.as_tensor(robot.NOMINAL_STANCE, dtype=torch.float32, device=self.device)
-        self._started, self._deferred = False, self.device.type == "cuda"  # where to look at a value is to wait for it
-        self._evidence, self.captures = Evidence(), task.backend.captures
+        self._started, self._evidence, self.captures = False, Evidence(), task.backend.captures
+        self._deferred = self.device.type == "cuda"  # where to look at a value is to wait for it
         self._captured: CapturedStep | None = None
 
     def _build_ground(self, first_env: int) -> None:
