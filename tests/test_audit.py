@@ -23,6 +23,7 @@ from go1exp.cli.record import AUDIT
 from go1exp.config.schema import registry
 from go1exp.logs import excitations
 from go1exp.logs.audit import AuditReport, audit, audit_file, clock_flaws, signals
+from go1exp.logs.audit.impossible import impossible, without
 from go1exp.logs.recording import Recording, RecordingError, joint_channels, write
 from go1exp.robot import EFFORT_LIMIT, JOINT_POS_LIMITS, JOINTS, NOMINAL_STANCE, per_joint, soft_limits
 from tests.made import meta as made_meta
@@ -810,3 +811,74 @@ def test_the_ak80s_messages_are_recognised(design: str) -> None:
 def test_a_real_go1_snippet_is_sound() -> None:
     (recording,) = real("go1_walk_snippet")
     assert audit(recording).flaws == []
+
+
+def trotting(order: tuple[int, ...] = tuple(range(12)), flip: int | None = None) -> Recording:
+    """Joints of a trot, legs in antiphase, under the PD law and a load that turns one joint against its target."""
+    r = made("steps")
+    t = r.t
+    phase = np.repeat([0.0, np.pi, np.pi, 0.0], 3)
+    target = NOMINAL_STANCE + 0.3 * np.sin(2 * np.pi * 2.0 * t[:, None] + phase)
+    q = NOMINAL_STANCE + 0.27 * np.sin(2 * np.pi * 2.0 * (t[:, None] - 0.03) + phase)
+    q[:, 2] = NOMINAL_STANCE[2] - 0.24 * np.sin(2 * np.pi * 2.0 * t)
+    q += 0.03 * np.sin(2 * np.pi * 3.3 * t[:, None] + np.arange(12.0))
+    qd = np.gradient(q, t, axis=0)
+    tau = 20.0 * (target - q) - 0.5 * qd
+    if flip is not None:
+        q, qd = q.copy(), qd.copy()
+        q[:, flip], qd[:, flip] = -q[:, flip], -qd[:, flip]
+    q, qd, tau = (x[:, list(order)] for x in (q, qd, tau))
+    joints = {"q": q, "qd": qd, "q_target": target, "tau_est": tau}
+    return with_(
+        r, **{c: v.copy() for k, x in joints.items() for c, v in zip(joint_channels(k, JOINTS), x.T, strict=True)}
+    )
+
+
+def test_a_joint_that_load_moves_against_its_target_has_no_flipped_sign() -> None:
+    assert audit(trotting()).by_check("sign") == []
+    assert {f.channel for f in audit(trotting(flip=5)).by_check("sign")} == {f"q_{JOINTS[5]}"}
+
+
+def test_another_order_of_legs_in_antiphase_is_an_order_and_no_sign() -> None:
+    report = audit(trotting(order=(3, 4, 5, 0, 1, 2, 6, 7, 8, 9, 10, 11)))
+    named = {f.channel for f in report.by_check("order")}
+    assert {f"q_target_{j}" for j in JOINTS[:2]} <= named
+    assert not {f.channel for f in report.by_check("sign")} & {f"q_{j}" for j in (*JOINTS[:2], *JOINTS[3:5])}
+
+
+def test_the_mean_of_an_accelerometer_in_motion_is_gravity_however_hard_the_feet_land() -> None:
+    r = made("steps")
+    t = r.t
+    shocks = 40.0 * np.sign(np.sin(2 * np.pi * 40.0 * t))
+    report = audit(with_(r, imu_acc_z=r.channels["imu_acc_z"] + shocks))
+    assert report.by_check("gravity") == []
+    assert audit(with_(r, imu_acc_z=1.4 * (r.channels["imu_acc_z"] + shocks))).by_check("gravity")
+
+
+def test_a_step_of_a_speed_is_not_called_by_the_name_of_a_torques() -> None:
+    r = made("steps")
+    step = 1.0 / 256.0
+    messages = {
+        f.channel: f.message
+        for f in audit(
+            with_(r, **{c: np.round(r.channels[c] / step) * step for c in ("qd_FR_hip", "tau_est_FR_hip")})
+        ).by_check("resolution")
+    }
+    assert "1/256 N m" in messages["tau_est_FR_hip"]
+    assert "N m" not in messages["qd_FR_hip"]
+
+
+def test_rows_that_their_neighbours_rule_out_are_named_and_left_out() -> None:
+    r = realistic(made("steps"))
+    lost = np.zeros(ROWS, dtype=bool)
+    lost[[300, 900, 901, 1700]] = True
+    zeros = with_(r, **{c: np.where(lost, 0.0, r.channels[c]) for c in joint_channels("q", JOINTS)})
+    assert impossible(r).findings == ()
+    np.testing.assert_array_equal(impossible(zeros).rows, lost)
+    spiked = r.channels["q_FR_hip"] + 0.3 * lost
+    found = impossible(with_(r, q_FR_hip=spiked))
+    np.testing.assert_array_equal(found.rows, lost)
+    assert [f.channel for f in found.findings] == ["q_FR_hip"]
+    wrapped = np.where(np.arange(ROWS) < 800, 2 * np.pi, 0.0) + r.channels["q_FL_calf"]
+    np.testing.assert_array_equal(impossible(with_(r, q_FL_calf=wrapped)).rows, np.arange(ROWS) < 800)
+    assert len(without(zeros, lost).t) == ROWS - 4

@@ -104,6 +104,10 @@ def _task(container: dict[str, Any]) -> None:
     pictures = plots.plot(result, out) if settings.plots else []
     print(report.text(result.report))
     print(f"\nwritten to {out}: net.npz, net.onnx, report.json{''.join(f', {p.name}' for p in pictures)}")
+    if wrong := report.useless(result.report):
+        print(f"bad: the net is {'; '.join(wrong)}: do not train a policy with it")
+        return
+    print("good: on the held-out episodes the net is better than zero and every simple model")
     print(f"now: {command('train', 'actuator=net', settings={'actuator.file': out / 'net.npz'})}")
 
 

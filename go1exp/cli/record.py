@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -66,10 +66,12 @@ class AuditSettings:
 
     Attributes:
         files: recordings (.parquet), or folders of them.
+        tables: whether to print the tables of recordings that are ok, too.
         out: JSON file for the findings; null writes none.
     """
 
     files: Annotated[tuple[str, ...], Field(min_length=1)]
+    tables: bool
     out: str | None
 
 
@@ -81,6 +83,7 @@ class ImportSettings:
         source: name of the importer (go1exp list importer).
         path: its file, or a folder of them.
         options: the importer's own parameters, such as {rate_hz: 100.0}, or a FILE.yaml of them.
+        drop: impossible leaves out rows that their neighbours rule out; null leaves out none.
         columns: of source=csv: channel -> column, such as {t: time, q_knee: {column: pos, unit: deg}}, or a FILE.yaml.
         out: folder for the recordings.
     """
@@ -89,6 +92,7 @@ class ImportSettings:
     path: str
     options: dict[str, Any] | str | None
     columns: dict[str, Any] | str | None
+    drop: Literal["impossible"] | None
     out: FolderName
 
 
@@ -258,7 +262,7 @@ def _audit(container: dict[str, Any]) -> int:
             unreadable.append(str(error))
             reports[str(file)] = {"verdict": "unreadable", "message": str(error)}
             continue
-        print(f"{file}\n{report.text()}\n")
+        print(f"{file}\n{report.text()}\n" if settings.tables or report.verdict != "ok" else f"{file}: ok")
         reports[str(file)] = report.as_dict()
         folders.setdefault(file.parent, {})[file] = report
         status = max(status, AUDIT_STATUS[report.verdict])
@@ -274,6 +278,8 @@ def _audit(container: dict[str, Any]) -> int:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_json(out, reports)
         print(f"written to {out}")
+    counts = Counter(report["verdict"] for report in reports.values())
+    print(f"{counted(len(reports), 'recording')}: {', '.join(f'{n} {verdict}' for verdict, n in counts.items())}")
     if unreadable:  # the others have been audited
         raise RecordingError("\n".join(unreadable))
     return status
@@ -295,6 +301,11 @@ def _import(container: dict[str, Any]) -> None:
     if settings.columns is not None:
         options["columns"] = mapping_of(settings.columns, "columns")
     recordings = import_recordings(settings.source, Path(settings.path), options)
+    if settings.drop:
+        from go1exp.logs.audit.impossible import impossible, without
+
+        marked = [(r, impossible(r).rows) for r in recordings]
+        recordings = [without(r, rows) if rows.any() else r for r, rows in marked]
     _refuse_one_name(settings.path, [r.meta.episode for r in recordings])
     out = writable(settings.out)
     names = [f"{r.meta.episode}.parquet" for r in recordings]

@@ -21,6 +21,8 @@ from go1exp.gap.score.initial_state import measured, repeatability
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.search.clocks import OF_CLOCK, Contestant, contest, details, rows_of, same_rows
 from go1exp.logs.audit import audit, clock_flaws
+from go1exp.logs.audit.impossible import impossible, without
+from go1exp.logs.audit.limits import MOST_IMPOSSIBLE
 from go1exp.logs.recording import Recording, RecordingError
 from go1exp.robot.config import RobotConfig
 
@@ -115,6 +117,7 @@ def prepare(recordings: Sequence[Recording], robot: Robot, settings: GapSettings
         NotComparable: if too many of them cannot.
     """
     robot = robot.suited(recordings, settings.phase)
+    recordings, removed = _possible(recordings)
     reports = [audit(r) for r in recordings]
     clocks = clock_flaws(reports)
     flaws = [
@@ -127,8 +130,20 @@ def prepare(recordings: Sequence[Recording], robot: Robot, settings: GapSettings
         sentence = f"These logs cannot be compared with the model: {'; '.join(lines[:3])}."
         raise NotComparable(sentence, lines, lines)
     ready = robot.prepared([recordings[k] for k in good], [reports[k] for k in good], settings)
-    omitted = (f"Left out: {line}." for line in lines)
+    omitted = (f"Left out: {line}." for line in (*removed, *lines))
     return robot, Ready(ready.recordings, ready.settings, ready.ignored, (*omitted, *ready.warnings))
+
+
+def _possible(recordings: Sequence[Recording]) -> tuple[list[Recording], list[str]]:
+    """Return recordings without rows that their neighbours rule out, and a line for each; with too many, as it is."""
+    kept, lines = [], []
+    for r in recordings:
+        found = impossible(r)
+        few = 0.0 < found.rows.mean() <= MOST_IMPOSSIBLE
+        kept.append(without(r, found.rows) if few else r)
+        if few:
+            lines += [f"{r.meta.episode}: {f.channel}: {f.message}" for f in found.findings]
+    return kept, lines
 
 
 def compare(

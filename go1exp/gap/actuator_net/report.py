@@ -205,6 +205,26 @@ def report(
     return Report(target, split, tuple(cells), tuple(by_episode), missing, tuple(limits))
 
 
+WORTH = 0.95
+"""Share of the error of zero, PD law and linear map below which a net is worth more (chosen)."""
+
+
+def useless(report: Report) -> list[str]:
+    """Return why a net should not train a policy, a phrase each; empty if it is better than every simple model."""
+    wrong = []
+    for regime in ("all", "high torque"):
+        if not any((c.joint, c.regime) == ("all", regime) for c in report.cells):
+            continue
+        cell = report.cell("all", regime)
+        simple = {"zero": cell.rms, **{name: cell.rmse[name] for name in ("pd", "linear") if name in cell.rmse}}
+        for name, error in simple.items():
+            # At high torque alone a net may tie; it must not be worse.
+            if cell.rmse["net"] > error * (WORTH if regime == "all" else 1.0):
+                where = "" if regime == "all" else " at high torque"
+                wrong.append(f"no better than {name}{where} ({cell.rmse['net']:.3g} against {error:.3g} N m)")
+    return wrong
+
+
 def text(report: Report) -> str:
     """Return a report as text for a terminal; errors in N m, the smallest of each line marked with a star."""
     parts = [

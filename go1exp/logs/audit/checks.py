@@ -14,6 +14,7 @@ import go1exp.logs.audit.related as related
 import go1exp.logs.audit.signals as signals
 import go1exp.logs.audit.single as single
 from go1exp.logs.audit.commands import Delay
+from go1exp.logs.audit.impossible import impossible
 from go1exp.logs.audit.report import ORDER, AuditReport, Channel, Finding, worst
 from go1exp.logs.audit.signals import Log, finding
 from go1exp.logs.recording import Recording, problems, read
@@ -41,7 +42,9 @@ def audit(recording: Recording) -> AuditReport:
     if not _computable(recording):
         return _report(recording, format_findings, ())
     log = Log(recording)
+    found = impossible(recording)
     findings, measured = _run_checks(log)
+    findings = [*found.findings, *findings]
     off, still = _times(log, ~log.on), _times(log, log.still)
     if off:
         total = sum(b - a for a, b in off)

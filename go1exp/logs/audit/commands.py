@@ -31,7 +31,12 @@ def order_and_sign(log: Log) -> Iterator[Finding]:
         return
     target, q = _matches_inputs(log)
     match = _lagged_correlation(log, target, q)
-    partner = signals.mixed_up(match)
+    partner = _other_order(log, match)
+    # Weight moves a leg against its target; without a law that weight does not change, only a held base shows a sign.
+    follows = _controller_law(log)
+    against = (follows < 0) | (
+        (follows == 0) & (np.diag(match) < -limits.CLEARLY) & (log.recording.meta.base == "fixed")
+    )
     for j, joint in enumerate(log.joints):
         if j in partner:
             other = log.joints[partner[j]]
@@ -40,11 +45,65 @@ def order_and_sign(log: Log) -> Iterator[Finding]:
             swap = partner[partner[j]] == j
             message += f"{joint} and {other} are swapped" if swap else f"what is called {other} is the joint it moves"
             yield finding("order", joint_channel("q_target", joint), "bad", match[j, partner[j]], "", message)
-        elif match[j, j] < -limits.CLEARLY:
-            message = f"goes against q_target_{joint} (correlation {match[j, j]:.2f}): a sign is flipped"
+        elif against[j]:
+            shown = "by tau_est" if follows[j] < 0 else f"correlation {match[j, j]:.2f}"
+            message = f"goes against q_target_{joint} ({shown}): a sign is flipped"
             yield finding("sign", joint_channel("q", joint), "bad", match[j, j], "", message)
         elif match[j, j] > limits.CLEARLY:
             yield from _other_unit(joint, float(np.std(q[:, j]) / np.std(target[:, j])))
+
+
+def _other_order(log: Log, match: np.ndarray) -> dict[int, int]:
+    """Return the joints that follow the target of another, by the correlations ``match`` (J, J).
+
+    Legs in antiphase go against each other's targets. Then another order and flipped signs correlate alike, and what
+    brings the angles nearer to the targets is right.
+    """
+    partner = signals.mixed_up(match)
+    if partner:
+        return partner
+    target, q = (log.recording.joint(name)[log.on] for name in ("q_target", "q"))
+    apart = np.abs(target.mean(axis=0)[:, None] - q.mean(axis=0))  # rad; legs in phase differ by their means alone
+    partner = signals.mixed_up(np.maximum(match, 0.0) * np.exp(-apart))
+    if not partner:
+        return {}
+    own = list(partner)
+    exchanged = np.mean((target[:, own] - q[:, list(partner.values())]) ** 2)
+    return partner if exchanged < np.mean((target[:, own] + q[:, own]) ** 2) else {}
+
+
+def _controller_law(log: Log) -> np.ndarray:
+    """Return the sign (J,) by which angles count in the law of the controller: 1 right, -1 flipped, 0 unknown.
+
+    The reported torque is fitted by target, angle and speed, at the best delay: tau = a q_target - b q - c qd + d. A
+    load changes none of the factors, and a and b have one sign.
+    """
+    r, signs = log.recording, np.zeros(len(log.joints))
+    if not r.has("tau_est"):
+        return signs
+    motion = np.stack([r.joint(name) for name in ("q", "qd") if r.has(name)], axis=2)
+    target, tau = r.joint("q_target"), r.joint("tau_est")
+    for j in range(len(signs)):
+        best = limits.LAW
+        if abs(_correlation(target[:, j], motion[:, j, 0])) > limits.ALIKE:
+            continue  # then their factors cannot be separated
+        for lag in range(0, log.samples(limits.TORQUE_LAG) + 1, log.samples(0.002)):
+            now = np.flatnonzero(log.on[lag:]) + lag
+            inputs = np.column_stack([target[now - lag, j], motion[now, j], np.ones(len(now))])
+            y = tau[now, j]
+            factors = np.linalg.lstsq(inputs, y, rcond=None)[0]
+            explained = 1.0 - np.var(y - inputs @ factors) / max(float(np.var(y)), 1e-12)
+            if explained > best and min(np.std(inputs[:, k] * factors[k]) for k in (0, 1)) > limits.LAW_PART * np.std(
+                y
+            ):
+                best, signs[j] = explained, -np.sign(factors[0] * factors[1])
+    return signs
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the correlation of two series (T,), 0 where one is constant."""
+    a, b = a - a.mean(), b - b.mean()
+    return float(a @ b / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12))
 
 
 def _other_unit(joint: str, times: float) -> Iterator[Finding]:

@@ -55,18 +55,22 @@ CONTINUOUS = 2.0**-22
 """Steps below this share of the largest value are those of 32-bit floats, not of a sensor."""
 
 KNOWN_STEPS = {
-    "12 bits a turn (Dynamixel XL330, Feetech STS3215)": 2 * math.pi / 4096,
-    "14 bits a turn": 2 * math.pi / 16384,
-    "14 bits a turn behind 6.33:1 (Unitree Go1 hip and thigh)": 2 * math.pi / 16384 / 6.33,
-    "14 bits a turn behind 9.5:1 (Unitree Go1 calf)": 2 * math.pi / 16384 / 9.5,
-    "15 bits a turn behind 6.33:1 (Unitree GO-M8010-6 class)": 2 * math.pi / 32768 / 6.33,
-    "15 bits a turn behind 9.5:1 (Unitree calf)": 2 * math.pi / 32768 / 9.5,
-    "16 bits over 25 rad (T-Motor AK series, CAN)": 25 / 65535,
-    "12 bits over 24 N m (T-Motor AK80-6, CAN)": 24 / 4095,
-    "12 bits over 45 rad/s (T-Motor AK80-6, CAN)": 45 / 4095,
-    "1/256 N m (Unitree Go1, low-level packets)": TORQUE_STEP,
+    "rad": {
+        "12 bits a turn (Dynamixel XL330, Feetech STS3215)": 2 * math.pi / 4096,
+        "14 bits a turn": 2 * math.pi / 16384,
+        "14 bits a turn behind 6.33:1 (Unitree Go1 hip and thigh)": 2 * math.pi / 16384 / 6.33,
+        "14 bits a turn behind 9.5:1 (Unitree Go1 calf)": 2 * math.pi / 16384 / 9.5,
+        "15 bits a turn behind 6.33:1 (Unitree GO-M8010-6 class)": 2 * math.pi / 32768 / 6.33,
+        "15 bits a turn behind 9.5:1 (Unitree calf)": 2 * math.pi / 32768 / 9.5,
+        "16 bits over 25 rad (T-Motor AK series, CAN)": 25 / 65535,
+    },
+    "rad/s": {"12 bits over 45 rad/s (T-Motor AK80-6, CAN)": 45 / 4095},
+    "N m": {
+        "12 bits over 24 N m (T-Motor AK80-6, CAN)": 24 / 4095,
+        "1/256 N m (Unitree Go1, low-level packets)": TORQUE_STEP,
+    },
 }
-"""Steps of encoders and messages in use; a step within ``KNOWN`` of one is called by its name."""
+"""Unit -> steps of encoders and messages in use; a step within ``KNOWN`` of one of its unit is called by its name."""
 KNOWN = 2e-3
 """Relative error: a step is found to better than a thousandth, and the closest two differ by five."""
 
@@ -98,6 +102,11 @@ CLEARLY = 0.7
 """Correlation above which a sign is certain, and another joint can be a better match."""
 BETTER = 0.25
 """The correlation with another joint must exceed that with the joint itself by this."""
+LAW, LAW_PART = 0.9, 0.1
+"""Share of a reported torque that target, angle and speed must explain before they show a sign, and least spread of
+the parts of target and angle against that of the torque."""
+ALIKE = 0.9999
+"""Correlation of target and angle above which a law of both shows nothing."""
 LEAST_TIME = 2.0
 """s of motion below which order, sign and delay are not checked: any two slow curves of one second look alike."""
 DELAY = 8e-3
@@ -129,6 +138,21 @@ POSITION_MARGIN = (0.08, 0.3)
 """rad beyond a hard stop: 5 degrees can be play, a soft stop and a zero offset; 17 are a wrong unit, order or sign."""
 EXCEEDED = 1.25
 """Torque and speed may exceed their limit by this factor: limits are nominal; an ideal actuator has no speed limit."""
+
+# ---------------------------------------------------------------------- samples that neighbours rule out
+
+FASTEST = 60.0
+"""rad/s; no joint of unknown speed turns faster (chosen: twice the actuators of this class)."""
+REVERSED = 12.0
+"""rad/s; no joint turns out and back at such a speed within one sample (chosen)."""
+UNUSUAL = 10.0
+"""Times the 90 % quantile of what a channel goes out and back within a sample; also for noise."""
+ZERO_JUMP = 8.0
+"""Times the 95 % quantile of a channel's steps, by which rows of zeros must be entered and left."""
+SPANS = 5.0
+"""Spans of 99 % of a channel by which a torque or a reading of the IMU must lie outside; impacts are spikes, too."""
+MOST_IMPOSSIBLE = 0.2
+"""Share of impossible rows above which a recording is refused and not only those rows."""
 
 # ---------------------------------------------------------------------- motion in the episode
 

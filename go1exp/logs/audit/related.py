@@ -14,6 +14,9 @@ from go1exp.logs.audit.signals import Log, finding, graded
 from go1exp.logs.recording import VECTORS, joint_channel
 from go1exp.robot import GRAVITY
 
+BLOCKS = 10
+"""Stretches of time for the error of a mean in motion."""
+
 SPEED_CHECKS = ("scale", "lag", "repeats")
 """Checks after which a recorded speed is not to be trusted, even if they only call it suspect."""
 
@@ -197,15 +200,27 @@ def attitude_length(log: Log) -> Iterator[Finding]:
 
 
 def gravity(log: Log) -> Iterator[Finding]:
-    """Check length and direction of the measured gravity while the robot rests; on average if it never does."""
+    """Check length and direction of the measured gravity: at rest by its length, in motion by its mean.
+
+    In motion the length of the acceleration says nothing. Its mean in the world frame is gravity plus the change of
+    velocity over the duration, whatever the robot does. The mean of what a body axis reads is less where it tilts.
+    """
     names = VECTORS["imu_acc"]
     if not set(names) <= set(log.quantity):
         return
     acc = log.recording.block(*names)
-    rest = log.still if log.still.sum() >= limits.ENOUGH else np.ones(len(acc), dtype=bool)
-    reading = float(np.median(np.linalg.norm(acc[rest], axis=1)))
-    where = "at rest" if rest is log.still else "on average"
-    off = abs(reading / GRAVITY - 1)
+    resting = log.still.sum() >= limits.ENOUGH
+    rest = log.still if resting else np.ones(len(acc), dtype=bool)
+    source = next((q for q in ("imu_quat", "base_quat") if set(VECTORS[q]) <= set(log.quantity)), None)
+    if source and np.linalg.norm(log.recording.block(*VECTORS[source]), axis=1).min() < 1e-3:
+        source = None
+    world = _attitude(log, source)[rest].apply(acc[rest]) if source else acc[rest]
+    blocks = np.array([part.mean(axis=0) for part in np.array_split(world, min(BLOCKS, len(world)))])
+    mean = world.mean(axis=0)
+    error = 0.0 if resting else float(np.linalg.norm(blocks.std(axis=0)) / np.sqrt(len(blocks)))
+    reading = float(np.median(np.linalg.norm(acc[rest], axis=1)) if resting else np.linalg.norm(mean))
+    where = "at rest" if resting else "on average"
+    off = max(0.0, abs(reading / GRAVITY - 1) - 2.0 * error / GRAVITY)
     channel = "imu_acc"
     if off > limits.GRAVITY_ERROR[0]:
         message = f"reads {reading:.4g} {where}; gravity is {GRAVITY} m/s2"
@@ -213,13 +228,11 @@ def gravity(log: Log) -> Iterator[Finding]:
         guess = guess or ("gravity taken out" if reading < 0.5 else "")
         if guess:
             yield finding("units", channel, "bad", reading, "m/s2", f"{message}: it looks like {guess}")
-        elif rest is log.still or off > limits.GRAVITY_ERROR[1]:
+        elif resting or off > limits.GRAVITY_ERROR[1]:
             yield finding("gravity", channel, graded(off, limits.GRAVITY_ERROR), reading, "m/s2", message)
-    source = next((q for q in ("imu_quat", "base_quat") if set(VECTORS[q]) <= set(log.quantity)), None)
-    if source is None or reading < 0.5 or np.linalg.norm(log.recording.block(*VECTORS[source]), axis=1).min() < 1e-3:
+    if source is None or reading < 0.5:
         return
-    up = _attitude(log, source)[rest].apply(acc[rest]).mean(axis=0)
-    tilt = float(np.degrees(np.arccos(np.clip(up[2] / np.linalg.norm(up), -1, 1))))
+    tilt = float(np.degrees(np.arccos(np.clip(mean[2] / np.linalg.norm(mean), -1, 1))))
     verdict = graded(tilt, limits.TILT)
     if verdict != "ok":
         why = "its sign is flipped (at rest it must read +9.81 upwards)" if tilt > 150 else "axes or quaternion order"

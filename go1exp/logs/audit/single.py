@@ -128,7 +128,7 @@ def resolution(log: Log) -> Iterator[Finding]:
         if step == 0:
             continue
         unit = log.unit(name)
-        known = next((k for k, s in limits.KNOWN_STEPS.items() if abs(step / s - 1) < limits.KNOWN), None)
+        known = next((k for k, s in limits.KNOWN_STEPS.get(unit, {}).items() if abs(step / s - 1) < limits.KNOWN), None)
         message = f"steps of {step:.3g} {unit}".rstrip() + (f": {known}" if known else "")
         coarse = unit == "rad" and step > limits.COARSE_ANGLE
         if coarse:
