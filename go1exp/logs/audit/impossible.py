@@ -59,6 +59,11 @@ def _wrong(recording: Recording) -> Iterator[tuple[str, np.ndarray, str]]:
             continue
         values = recording.block(*columns)
         zeros = _zeros(values, at_ends=quantity == "q")
+        if quantity == "qd":  # a coarse encoder at rest reads zero, too
+            slope = np.gradient(recording.joint("q"), t, axis=0) if recording.has("q") else np.zeros_like(values)
+            zeros &= np.any(np.abs(slope) > limits.TURNS, axis=1)
+        elif quantity == "tau_est":  # of actuators that are off
+            zeros &= False
         if zeros.any():
             yield (columns[0] if len(columns) == 1 else quantity), zeros, "are zeros between values far from zero"
         for k, name in enumerate(columns):

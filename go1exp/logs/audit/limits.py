@@ -145,6 +145,8 @@ FASTEST = 60.0
 """rad/s; no joint of unknown speed turns faster (chosen: twice the actuators of this class)."""
 REVERSED = 12.0
 """rad/s; no joint turns out and back at such a speed within one sample (chosen)."""
+TURNS = 1.0
+"""rad/s of the angles at which joints that read no speed are misread (chosen: far above an encoder's noise)."""
 UNUSUAL = 10.0
 """Times the 90 % quantile of what a channel goes out and back within a sample; also for noise."""
 ZERO_JUMP = 8.0
