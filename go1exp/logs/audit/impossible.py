@@ -68,7 +68,8 @@ def _wrong(recording: Recording) -> Iterator[tuple[str, np.ndarray, str]]:
             yield (columns[0] if len(columns) == 1 else quantity), zeros, "are zeros between values far from zero"
         for k, name in enumerate(columns):
             if quantity == "q":
-                jumps = _jumps(t, values[:, k], _fastest(recording, k)) & ~zeros
+                jumps = np.zeros(len(t), dtype=bool)
+                jumps[~zeros] = _jumps(t[~zeros], values[~zeros, k], _fastest(recording, k))
                 if jumps.any():
                     speed = np.abs(np.diff(values[:, k]) / np.diff(t)).max()
                     yield name, jumps, f"are apart from the others by jumps, at up to {speed:.3g} rad/s"
