@@ -228,11 +228,11 @@ def spinner(total: int, what: str) -> Callable[[int, int], None]:
     """Return a callback ``(done, total)`` that shows a progress bar in a terminal, and lines elsewhere."""
     if not sys.stderr.isatty():
         announce(what)
-        said = [time.monotonic()]
+        printed_at = [time.monotonic()]
 
         def say(done: int, total: int) -> None:
-            if done < total and time.monotonic() - said[0] >= LINE_PERIOD:
-                said[0] = time.monotonic()
+            if done < total and time.monotonic() - printed_at[0] >= LINE_PERIOD:
+                printed_at[0] = time.monotonic()
                 print(f"{what}: {100 * done / total:.0f} %", file=sys.stderr, flush=True)
 
         return say
