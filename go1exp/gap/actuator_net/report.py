@@ -216,7 +216,7 @@ def useless(report: Report) -> list[str]:
         if not any((c.joint, c.regime) == ("all", regime) for c in report.cells):
             continue
         cell = report.cell("all", regime)
-        simple: dict[str, float] = {"zero": cell.rms} | {name: cell.rmse[name] for name in ("pd", "linear") if name in cell.rmse}
+        simple = {"zero": cell.rms, **{name: error for name, error in cell.rmse.items() if name in ("pd", "linear")}}
         for name, error in simple.items():
             # At high torque alone a net may tie; it must not be worse.
             if cell.rmse["net"] > error * (WORTH if regime == "all" else 1.0):
