@@ -66,7 +66,7 @@ class AuditSettings:
 
     Attributes:
         files: recordings (.parquet), or folders of them.
-        tables: whether to print the tables of recordings that are ok, too.
+        tables: whether to print the tables of recordings that are ok, too; that of a single one is always printed.
         out: JSON file for the findings; null writes none.
     """
 
@@ -255,14 +255,19 @@ def _audit(container: dict[str, Any]) -> int:
     folders: dict[Path, dict[Path, AuditReport]] = {}
     unreadable: list[str] = []
     status = 0
-    for file in files_of(settings.files):
+    files = files_of(settings.files)
+    for file in files:
         try:
             report = audit_file(file)
         except RecordingError as error:
             unreadable.append(str(error))
             reports[str(file)] = {"verdict": "unreadable", "message": str(error)}
             continue
-        print(f"{file}\n{report.text()}\n" if settings.tables or report.verdict != "ok" else f"{file}: ok")
+        print(
+            f"{file}\n{report.text()}\n"
+            if settings.tables or len(files) == 1 or report.verdict != "ok"
+            else f"{file}: ok"
+        )
         reports[str(file)] = report.as_dict()
         folders.setdefault(file.parent, {})[file] = report
         status = max(status, AUDIT_STATUS[report.verdict])
@@ -278,8 +283,9 @@ def _audit(container: dict[str, Any]) -> int:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_json(out, reports)
         print(f"written to {out}")
-    counts = Counter(report["verdict"] for report in reports.values())
-    print(f"{counted(len(reports), 'recording')}: {', '.join(f'{n} {verdict}' for verdict, n in counts.items())}")
+    if len(files) > 1:
+        counts = Counter(report["verdict"] for report in reports.values())
+        print(f"{len(files)} recordings: {', '.join(f'{n} {verdict}' for verdict, n in counts.items())}")
     if unreadable:  # the others have been audited
         raise RecordingError("\n".join(unreadable))
     return status
