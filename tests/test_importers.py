@@ -393,7 +393,7 @@ def test_names_and_options_are_checked_before_any_file_is_opened() -> None:
 
 def test_every_importer_is_listed_with_a_sentence() -> None:
     recordings = members("importer")
-    assert set(recordings) == {*COUNTS, "mcap_joint_state", "csv"}
+    assert set(recordings) == {*COUNTS, "mcap_joint_state", "csv", "unitree_lowstate_go1", "unitree_lowstate_go2"}
     for entry in recordings.values():
         assert entry.doc.endswith(".")
         assert entry.schema.model_fields.keys() == entry.parameters.keys()
@@ -541,13 +541,13 @@ def spoilt(**fields: Any) -> Sent:
     [
         (states(5, ["a"]), {"state_topic": "/joints"}, "no message on topic '/joints'; it has /joint_states"),
         (states(5, ["a"]), {"command_topic": "/go"}, "no message on topic '/go'"),
-        (states(5, ["a"]), {"joints": ["c"]}, "/joint_states: message 0 lacks joint c"),
+        (states(5, ["a"]), {"joints": ["c"]}, r"/joint_states: lacks joint c; it has 5 messages of \(a\)"),
         (states(5, ["a"]), {"kp": [1.0, 2.0]}, "metadata.kp: has 2 values for 1 joints"),
         (states(5, ["a"], position=[]), {}, "its messages hold no position"),
         (states(1, ["a"]), {}, "t: has 1 stamp; at least 2 are needed"),
-        (spoilt(name=["a", "c"]), {}, "message 3 lacks joint b"),
+        (spoilt(name=["a", "c"]), {"joints": ["b", "c"]}, "has all of the joints in no single message"),
         (spoilt(position=[1.0]), {}, "message 3 has 2 names, but 1 of position"),
-        (spoilt(effort=[1.0, 2.0]), {}, "message 0 has 2 names, but 0 of effort"),
+        (spoilt(velocity=[1.0]), {}, "message 3 has 2 names, but 1 of velocity"),
         (spoilt(position=[1.0, float("nan")]), {}, "q_b: must be finite"),
         (spoilt(header=message(2, [])["header"]), {}, "t: must increase strictly, but row 3"),
     ],

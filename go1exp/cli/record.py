@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -296,6 +295,8 @@ AUDIT = App("record_audit", _audit, AuditSettings, title="record audit")
 
 NAMED = 3
 """Most files that a note names."""
+MOST_NOTES = 10
+"""Most notes of recordings that an import prints."""
 
 
 def _import(container: dict[str, Any]) -> None:
@@ -312,26 +313,16 @@ def _import(container: dict[str, Any]) -> None:
 
         marked = [(r, impossible(r).rows) for r in recordings]
         recordings = [without(r, rows) if rows.any() else r for r, rows in marked]
-    _refuse_one_name(settings.path, [r.meta.episode for r in recordings])
     out = writable(settings.out)
     names = [f"{r.meta.episode}.parquet" for r in recordings]
     if present := [name for name in names if (out / name).exists()]:
         print(f"note: {out} holds {_listed(present)} of an earlier call; new ones replace them (or: out=FOLDER)")
     _write(out, recordings)
-    for note in [*_wrong_steps(recordings), *dict.fromkeys(r.meta.notes for r in recordings if r.meta.notes)]:
+    notes = list(dict.fromkeys(r.meta.notes for r in recordings if r.meta.notes))
+    for note in [*_wrong_steps(recordings), *notes[:MOST_NOTES]]:
         print(f"note: {note}")
-
-
-def _refuse_one_name(path: str, names: Sequence[str]) -> None:
-    """Raise RecordingError if two recordings of one call have one name: the second would replace the first."""
-    from go1exp.logs.recording import RecordingError
-
-    twice = [name for name, times in Counter(names).items() if times > 1]
-    if twice:
-        raise RecordingError(
-            f"{path}: two files in it would both be {twice[0]}.parquet; "
-            "import each of their folders with an out of its own"
-        )
+    if len(notes) > MOST_NOTES:
+        print(f"note: {len(notes) - MOST_NOTES} more notes, in the metadata of the recordings")
 
 
 def _wrong_steps(recordings: Sequence[Recording]) -> list[str]:
@@ -344,10 +335,18 @@ def _wrong_steps(recordings: Sequence[Recording]) -> list[str]:
     for r in recordings:
         log = Log(r)
         if len(r.t) > 1 and (message := wrong_steps(log)):
-            unit = "ms" if log.dt > LEAST_STEP else "s"
-            remedy = f"with source=csv, columns gives the unit: t: {{column: NAME, unit: {unit}}}"
-            flaws.setdefault(f"t {message}; {remedy}", []).append(r.meta.episode)
+            if unit := _unit_of(message, log.dt < LEAST_STEP):
+                message += f"; with source=csv, columns gives the unit: t: {{column: NAME, unit: {unit}}}"
+            flaws.setdefault(f"t {message}", []).append(r.meta.episode)
     return [f"{_listed(episodes)}: {message}" for message, episodes in flaws.items()]
+
+
+def _unit_of(message: str, short: bool) -> str | None:
+    """Return the unit of a clock that ``wrong_steps`` names; seconds where the steps are too short."""
+    found = next(
+        (unit for name, unit in (("millis", "ms"), ("micros", "us"), ("nanos", "ns")) if name in message), None
+    )
+    return "s" if short else found
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -165,10 +165,12 @@ class Recording:
     Attributes:
         meta: its metadata.
         channels: column -> ``(T,)`` float64 (``torque_enable``: bool); ``t`` is required.
+        origin: file that it was imported from, or None.
     """
 
     meta: Meta
     channels: dict[str, np.ndarray]
+    origin: Path | None = None
 
     @property
     def t(self) -> np.ndarray:

@@ -7,15 +7,25 @@ Importing the package registers every importer, from this explicit list.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from go1exp.config.schema.registry import ConfigError, find, members, unknown_name
-from go1exp.logs.importers import arms, csv, mcap_joint_state, quadrupeds, scaler_walk_mocap
-from go1exp.logs.recording import Recording
+from go1exp.logs.importers import arms, csv, mcap_joint_state, quadrupeds, scaler_walk_mocap, unitree_lowstate
+from go1exp.logs.recording import Recording, RecordingError
 
-__all__ = ["arms", "csv", "import_recordings", "mcap_joint_state", "quadrupeds", "scaler_walk_mocap"]
+__all__ = [
+    "arms",
+    "csv",
+    "import_recordings",
+    "mcap_joint_state",
+    "quadrupeds",
+    "scaler_walk_mocap",
+    "unitree_lowstate",
+]
 
 
 def import_recordings(name: str, path: Path, options: Mapping[str, Any]) -> list[Recording]:
@@ -36,5 +46,26 @@ def import_recordings(name: str, path: Path, options: Mapping[str, Any]) -> list
     values, problems = entry.check(options, f"importer.{name}")
     if problems:
         raise ConfigError(problems)
-    recordings: list[Recording] = entry.target(Path(path), **values)
-    return recordings
+    return _named_apart(Path(path), entry.target(Path(path), **values))
+
+
+def _named_apart(path: Path, recordings: list[Recording]) -> list[Recording]:
+    """Return recordings with names of their own: those of one name get the folders of their files before it.
+
+    Raises:
+        RecordingError: if that does not tell them apart; with the files.
+    """
+    names = Counter(r.meta.episode for r in recordings)
+    result = []
+    for r in recordings:
+        name, folders = r.meta.episode, ()
+        if names[name] > 1 and r.origin is not None and path.is_dir():
+            folders = r.origin.parent.relative_to(path).parts
+        note = f"Called {name} in the source, as others are." if folders else ""
+        meta = replace(r.meta, episode="_".join((*folders, name)), notes=" ".join(filter(None, (r.meta.notes, note))))
+        result.append(replace(r, meta=meta))
+    for name, times in Counter(r.meta.episode for r in result).items():
+        if times > 1:
+            origins = ", ".join(str(r.origin) for r in result if r.meta.episode == name)
+            raise RecordingError(f"{path}: {times} recordings would be called {name}; rename a file of {origins}")
+    return result

@@ -1,9 +1,10 @@
-"""Any table of comma-separated values: a mapping says which column is which channel, in which unit."""
+"""Any table, as CSV or Parquet: a mapping says which column is which channel, in which unit."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import fields
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,8 +15,8 @@ from pydantic.dataclasses import dataclass
 from go1exp.base.wording import counted
 from go1exp.config.schema.joint_values import JointValues, each_within, spread
 from go1exp.config.schema.registry import STRICT, ConfigError, Positive, as_json, explain, importer, nearest
-from go1exp.logs.importers.source import LEVEL, files, recording
-from go1exp.logs.importers.table import UTF8, Layout, line_of, names, read
+from go1exp.logs.importers.source import LEVEL, files, recording, restarts, without_repeats
+from go1exp.logs.importers.table import UTF8, Layout, names, read
 from go1exp.logs.recording import FLAG, FOOT_FORCE, JOINT_QUANTITIES, VECTORS, Quaternion, Recording, RecordingError
 
 PATH = "importer.csv"
@@ -49,6 +50,13 @@ UNITS: dict[str, dict[str, float]] = {
 }
 """Quantity -> unit -> how many of our unit it is; the first is ours (1 kgf = 9.80665 N, the standard gravity)."""
 
+SPELLINGS = {"°": "deg", "°/s": "deg/s", "degrees": "deg", "Nm": "N m", "N.m": "N m", "N*m": "N m", "mNm": "mN m"}
+SPELLINGS |= {"m/s^2": "m/s2", "m/s²": "m/s2", "sec": "s", "µs": "us", "μs": "us", "radians": "rad", "rev": "turn"}
+"""Other spellings of units in a line of units."""
+
+OVERFLOW = (16, 24, 32)
+"""Bits of counters that begin anew at their end."""
+
 
 @dataclass(frozen=True, config=STRICT)
 class Column:
@@ -75,8 +83,11 @@ def _is_number(column: object) -> bool:
     return isinstance(column, int) and not isinstance(column, bool)
 
 
-def _columns(given: Mapping[str, Any]) -> tuple[dict[str, Column], list[str]]:
-    """Return channel -> column, and what is wrong with them as they are written."""
+def _columns(given: Mapping[str, Any], joints: tuple[str, ...] | None) -> tuple[dict[str, Column], list[str]]:
+    """Return channel -> column, and what is wrong with them as they are written.
+
+    A quantity, such as ``q``, is the column of a list with one element for each joint or axis.
+    """
     mapping, wrong = {}, []
     for name, value in given.items():
         if isinstance(value, str) or _is_number(value):
@@ -91,6 +102,12 @@ def _columns(given: Mapping[str, Any]) -> tuple[dict[str, Column], list[str]]:
                 mapping[name] = _COLUMN.validate_json(as_json({**value, **by_number}))
             except ValidationError as error:
                 wrong += explain(error, f"{PATH}.columns.{name}", [f.name for f in fields(Column)])
+    for name in [name for name in mapping if name in JOINT_QUANTITIES or name in VECTORS]:
+        whole = mapping.pop(name)
+        channels = VECTORS.get(name) or [f"{name}_{joint}" for joint in joints or ()]
+        if not channels:
+            wrong.append(f"{PATH}.columns.{name}: is a list of all joints; name them in its order by joints")
+        mapping |= {channel: replace(whole, column=f"{whole.column}[{k}]") for k, channel in enumerate(channels)}
     return mapping, wrong
 
 
@@ -102,6 +119,8 @@ def csv(
     columns: dict[str, Any] | None = None,
     joints: tuple[str, ...] | None = None,
     rate_hz: Positive | None = None,
+    episode: str | None = None,
+    drop_repeats: bool = False,
     base: Literal["fixed", "floating"] = "fixed",
     base_quat: Quaternion | None = None,
     kp: Annotated[JointValues, each_within(0.0)] | None = None,
@@ -116,15 +135,19 @@ def csv(
     decimal: Literal[".", ","] = ".",
     encoding: str = UTF8,
 ) -> list[Recording]:
-    """Any CSV of any robot: ``columns`` says which column is which channel, with unit, sign and offset.
+    """Any CSV or Parquet of any robot: ``columns`` says which column is which channel, with unit, sign and offset.
 
     Args:
-        path: a ``.csv``, or a folder of them; each file is one episode.
+        path: a ``.csv`` or ``.parquet``, or a folder of them. A file is one episode, unless its clock begins anew or
+            ``episode`` is given.
         robot: name of the robot, as the model's ``robots`` has it.
         columns: channel -> name of its column, or ``{column, unit, scale, offset}``. Channels are those of a recording:
             ``t``, ``q_JOINT``, ``qd_JOINT``, ``q_target_JOINT``, ``tau_cmd_JOINT``, ``tau_est_JOINT`` and others.
+            ``NAME[0]`` is the first element of a column of lists; ``q: NAME`` gives its elements to ``joints``.
         joints: names of the joints; by default those of the channels ``q_JOINT``, in their order.
         rate_hz: rows per second, Hz; needed where no column is the time, else taken from the time.
+        episode: column whose values, numbers or words, are the episodes; each becomes a recording.
+        drop_repeats: leave out rows with the time of the row before; the notes have their number.
         base: whether the base was ``fixed`` or ``floating``.
         base_quat: attitude of a fixed base, w-x-y-z; level if null.
         kp: position gains, N m/rad: a number, one for each joint, or a mapping.
@@ -143,8 +166,8 @@ def csv(
         ConfigError: if a channel, joint or unit does not exist, or a gain is missing; with every such problem.
         RecordingError: if a file is no table, lacks a column, or holds what is no number.
     """
-    mapping, wrong = _columns(columns or {})
-    tables = files(path, "*.csv")
+    mapping, wrong = _columns(columns or {}, joints)
+    tables = files(path, "*.csv", "*.parquet")
     if not _is_encoding(encoding):
         wrong.append(f"{PATH}.encoding = {encoding!r}: unknown encoding; utf-8, latin-1 or utf-16 will do")
         raise ConfigError(wrong)
@@ -158,41 +181,110 @@ def csv(
     about = {"robot": robot, "joints": called, "base": base, "excitation": excitation} | per_joint
     about["base_quat"] = base_quat or (LEVEL if base == "fixed" else None)
     about["source"] = "measured" if measured else "simulated"
-    return [_one(file, mapping, rate_hz, about, notes, layout) for file in tables]
+    return [
+        one
+        for file in tables
+        for one in _recordings(file, mapping, episode, rate_hz, about, notes, drop_repeats, layout)
+    ]
 
 
-def _one(
+def _recordings(
     path: Path,
     mapping: Mapping[str, Column],
+    episode: str | None,
     rate_hz: float | None,
     about: Mapping[str, Any],
     notes: str,
+    drop_repeats: bool,
     layout: Layout,
-) -> Recording:
-    """Return one file as a recording."""
+) -> Iterator[Recording]:
+    """Yield the episodes of one file."""
     wanted: dict[str, str] = {}
     for name, source in mapping.items():
         wanted[source.column] = ", ".join(filter(None, (wanted.get(source.column), name)))
-    table, unused = read(path, wanted, layout)
-    channels = {name: _channel(path, name, table[c.column], c) for name, c in mapping.items()}
-    remarks = [notes] if notes else []
-    rows = len(next(iter(channels.values())))
-    if "t" in channels:
+    labels = None if episode is None else {episode: "episode"} | wanted
+    table = read(path, labels or wanted, layout, episode if episode not in wanted else None)
+    mapping = _with_units(path, mapping, table.units)
+    channels = {name: _channel(path, name, table.columns[c.column], c) for name, c in mapping.items()}
+    general = [notes] if notes else []
+    if table.unused:
+        named = ", ".join(name or "one without a name" for name in table.unused)
+        general.append(f"Columns of the source that are left out: {named}.")
+    general += [f"Column {column!r} of the source is {names}." for column, names in wanted.items() if ", " in names]
+    if table.units:
+        general.append(f"Units of the line below the names: {', '.join(filter(None, table.units.values()))}.")
+    clock, cells = mapping.get("t"), np.empty(0)
+    if clock is not None:
         # Stamps may be seconds since 1970, of which float64 holds no more than parts of a microsecond.
-        column, start = mapping["t"], table[mapping["t"].column][0]
-        channels["t"] = _channel(path, "t", table[column.column] - start, column) - column.offset
-        _check_clock(path, channels["t"], table[column.column], column.column, layout)
-        remarks.append(f"t = 0 is {start} in the column {column.column!r}.")
-    else:
-        assert rate_hz is not None  # checked with the mapping
-        channels = {"t": np.arange(rows) / rate_hz} | channels
-        remarks.append(f"No clock in the source: t = row / {rate_hz:g} Hz.")
-    if unused:
-        named = ", ".join(name or "one without a name" for name in unused)
-        remarks.append(f"Columns of the source that are left out: {named}.")
-    remarks += [f"Column {column!r} of the source is {names}." for column, names in wanted.items() if ", " in names]
-    rate = {} if rate_hz is None else {"rate_hz": rate_hz}
-    return recording(path, "csv", channels, notes=" ".join(remarks), **rate, **about)
+        cells = table.columns[clock.column]
+        channels["t"] = _channel(path, "t", cells - cells[0], clock) - clock.offset
+    overflows = clock is not None and _overflow(cells)
+    times = channels["t"] if clock is not None and not overflows else None
+    parts = _episodes(None if episode is None else table.columns[episode], times, len(next(iter(channels.values()))))
+    for name, rows in parts:
+        remarks = list(general)
+        where = f"{path}: episode {name}" if name else str(path)
+        if clock is not None:
+            if drop_repeats:
+                kept = rows[without_repeats(channels["t"][rows])]
+                if left := len(rows) - len(kept):
+                    remarks.append(f"{counted(left, 'row')} with the time of the row before: left out.")
+                rows = kept
+            _check_clock(where, channels["t"][rows], cells[rows], clock.column, lambda k, at=rows: table.place(at[k]))
+            remarks.append(f"t = 0 is {cells[rows[0]]} in the column {clock.column!r}.")
+            own = {key: values[rows] for key, values in channels.items()}
+            own["t"] = own["t"] - own["t"][0]
+        else:
+            assert rate_hz is not None  # checked with the mapping
+            own = {"t": np.arange(len(rows)) / rate_hz} | {key: values[rows] for key, values in channels.items()}
+            remarks.append(f"No clock in the source: t = row / {rate_hz:g} Hz.")
+        if len(parts) > 1 and episode is None:
+            remarks.append(f"The clock begins anew {counted(len(parts) - 1, 'time')} in the file: one recording each.")
+        called = {"episode": f"{path.stem}_{name}"} if name else {}
+        rate = {} if rate_hz is None else {"rate_hz": rate_hz}
+        yield recording(path, "csv", own, notes=" ".join(remarks), **rate, **called, **about)
+
+
+def _episodes(labels: np.ndarray | None, t: np.ndarray | None, rows: int) -> list[tuple[str, np.ndarray]]:
+    """Return name and rows (K,) of each episode: by its label, and by where the clock ``t`` begins anew."""
+    by_label = [("", np.arange(rows))]
+    if labels is not None:
+        values, first, index = np.unique(labels, return_index=True, return_inverse=True)
+        groups = np.split(np.argsort(index, kind="stable"), np.cumsum(np.bincount(index))[:-1])
+        by_label = [(_label(values[k]), groups[k]) for k in np.argsort(first)]
+    found = []
+    for name, part in by_label:
+        begins = [] if t is None else restarts(t[part])
+        pieces = np.split(part, begins)
+        found += [(f"{name}_{k}".strip("_") if begins else name, piece) for k, piece in enumerate(pieces)]
+    return found
+
+
+def _label(value: Any) -> str:
+    """Return the value of an episode's column as a part of a file's name."""
+    whole = not isinstance(value, str) and value == int(value)
+    return re.sub(r"[^\w.-]+", "_", str(int(value) if whole else value)).strip("_") or "_"
+
+
+def _with_units(path: Path, mapping: Mapping[str, Column], units: Mapping[str, str]) -> dict[str, Column]:
+    """Return the columns with the units of the line below the names, where the mapping gives none.
+
+    Raises:
+        RecordingError: if such a unit is unknown.
+    """
+    result = dict(mapping)
+    for name, column in mapping.items():
+        quantity, text = _quantity(name), units.get(column.column, "").strip("[]() ")
+        text = SPELLINGS.get(text, text)
+        if column.unit is not None or text in ("", "-") or quantity is None:
+            continue
+        if text not in UNITS[quantity]:
+            raise RecordingError(
+                f"{path}: column {column.column!r} (for {name}): its unit is {text!r} in the line below the names; "
+                f"give one in columns: {', '.join(UNITS[quantity])}, with a scale if need be"
+            )
+        result[name] = replace(column, unit=text)
+    return result
 
 
 # ---------------------------------------------------------------------- the mapping
@@ -288,25 +380,42 @@ def _without_columns(path: Path, layout: Layout) -> str:
 # ---------------------------------------------------------------------- the numbers
 
 
-def _check_clock(path: Path, t: np.ndarray, cells: np.ndarray, column: str, layout: Layout) -> None:
-    """Raise RecordingError if the time ``t`` (T,), s, does not increase; with the line, its cell, and what to do."""
+def _check_clock(where: str, t: np.ndarray, cells: np.ndarray, column: str, place: Callable[[int], str]) -> None:
+    """Raise RecordingError if the time ``t`` (T,), s, does not increase; with its place, its cell, and what to do."""
     if len(t) < 2:
-        raise RecordingError(f"{path}: has {counted(len(t), 'row')} of numbers; at least 2 are needed")
+        raise RecordingError(f"{where}: has {counted(len(t), 'row')} of numbers; at least 2 are needed")
     steps = np.diff(t)
     back = np.flatnonzero(steps <= 0)
     if not back.size:
         return
     k = int(back[0])
-    line = f"line {line_of(path, k + 1, layout)} has {cells[k + 1]} after {cells[k]} ({counted(back.size, 'such row')})"
-    where = f"{path}: column {column!r} (for t): must increase strictly, but {line}"
+    rows = counted(back.size, "such row")
+    where = f"{where}: column {column!r} (for t): must increase strictly, but {place(k + 1)} has {cells[k + 1]} after"
+    where += f" {cells[k]} ({rows})"
+    if bits := _overflow(cells):
+        raise RecordingError(f"{where}; it is a counter of {bits} bits that overflows: add {2**bits} from there on")
     if steps.max() <= 0 and t[-1] < t[0]:
         raise RecordingError(f"{where}; it runs backward: put the rows in the other order")
     if steps.min() < 0:
-        raise RecordingError(f"{where}; sort the rows by time, or leave such rows out")
+        several = "sort the rows by time, or leave such rows out; if the file has several episodes, give their column"
+        raise RecordingError(f"{where}; {several} (episode: NAME)")
     if back.size < COARSE * len(steps) or t[-1] <= t[0]:
-        raise RecordingError(f"{where}; leave such rows out")
+        raise RecordingError(f"{where}; leave such rows out (drop_repeats: true)")
     hz = (len(t) - 1) / (t[-1] - t[0])
-    raise RecordingError(f"{where}; its times are rounded: take t out of columns and give rate_hz (about {hz:.3g})")
+    raise RecordingError(
+        f"{where}; its times are rounded: take t out of columns and give rate_hz (about {hz:.3g}), "
+        "or keep one row of each time (drop_repeats: true)"
+    )
+
+
+def _overflow(cells: np.ndarray) -> int | None:
+    """Return the bits of a counter (T,) that begins anew at its end; None if it is no such counter."""
+    steps = np.diff(cells.astype(np.float64))
+    ahead = steps[steps > 0]
+    if cells.dtype.kind not in "iu" or not ahead.size:
+        return None
+    usual = 10 * float(np.median(ahead))
+    return next((b for b in OVERFLOW if ((steps[steps < 0] + 2.0**b) > 0).all() and steps.min() + 2.0**b < usual), None)
 
 
 def _channel(path: Path, name: str, values: np.ndarray, column: Column) -> np.ndarray:

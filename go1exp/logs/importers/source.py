@@ -26,8 +26,47 @@ RATE_DIGITS = 6
 """Significant digits of a rate taken from time stamps."""
 
 
-def files(path: Path, pattern: str) -> list[Path]:
-    """Return ``path`` itself, or the files below the folder ``path`` that match ``pattern``, by name.
+RESTART = 0.5
+"""Least share of the time since the last beginning that a clock loses where it begins anew (chosen)."""
+MOST_STEPS = 10.0
+"""Longest step after that, in median steps (chosen): behind a single wrong stamp the clock leaps ahead."""
+
+KINDS = {
+    b"#ROSBAG": "a ROS 1 bag; make an MCAP of it: rosbags-convert --src FILE.bag --dst FOLDER --dst-storage mcap "
+    "(of the package rosbags)",
+    b"SQLite format 3": "a .db3 bag of ROS 2 or another SQLite file; make an MCAP of a bag: "
+    "mcap convert FILE.db3 FILE.mcap (of the mcap tool), or ros2 bag convert",
+    b"\x89MCAP0": "an MCAP log; import it with mcap_joint_state or an importer of its message",
+    b"\x28\xb5\x2f\xfd": "compressed by zstd as a whole; unpack it: zstd -d FILE",
+    b"\x1f\x8b": "compressed by gzip; unpack it: gunzip FILE",
+    b"PK\x03\x04": "a zip archive, as .npz and .xlsx are; save it as CSV or Parquet",
+    b"\x89HDF": "HDF5, as .mat of MATLAB may be; save it as CSV or Parquet",
+    b"MATLAB": "a .mat of MATLAB; save it as CSV or Parquet",
+    b"\x93NUMPY": "an array of NumPy; save it as CSV or Parquet",
+    b"PAR1": "Parquet; import it with csv",
+}
+"""How a file of another kind begins -> what it is, and how to make one that is read."""
+
+
+def beginning(path: Path) -> bytes:
+    """Return the first 4 KiB of a file; of ``run.csv.gz`` and its like, those of what is compressed."""
+    import pyarrow as pa
+
+    try:
+        with pa.input_stream(str(path)) as stream:
+            return bytes(stream.read(4096))
+    except OSError:  # not what its ending says
+        with path.open("rb") as file:
+            return file.read(4096)
+
+
+def kind(start: bytes) -> str | None:
+    """Return what a file is by its first bytes, and how to make one of it that is read; None if unknown."""
+    return next((what for magic, what in KINDS.items() if start.startswith(magic)), None)
+
+
+def files(path: Path, *patterns: str) -> list[Path]:
+    """Return ``path`` itself, or the files below the folder ``path`` that match the first pattern of any, by name.
 
     The ending may be in capitals: ``*.csv`` matches ``RUN.CSV``, too.
 
@@ -38,10 +77,34 @@ def files(path: Path, pattern: str) -> list[Path]:
         return [path]
     if not path.exists():
         raise RecordingError(f"{path}: no such file or folder")
-    matches = sorted(file for file in path.rglob("*") if fnmatch(file.name.lower(), pattern.lower()) and file.is_file())
-    if not matches:
-        raise RecordingError(f"{path}: no {pattern} in this folder")
-    return matches
+    present = sorted(file for file in path.rglob("*") if file.is_file())
+    for pattern in patterns:
+        if matches := [file for file in present if fnmatch(file.name.lower(), pattern.lower())]:
+            return matches
+    other = next((f"; {f.name} is {what}" for f in present if (what := kind(beginning(f)))), "")
+    raise RecordingError(f"{path}: no {' or '.join(patterns)} in this folder{other}")
+
+
+def restarts(t: np.ndarray) -> list[int]:
+    """Return the rows at which a clock ``t`` (T,) begins anew; none if any step back is none of that kind.
+
+    There it loses at least half of what has passed since the last beginning, and then goes on by ordinary steps.
+    """
+    steps = np.diff(t)
+    ordinary = MOST_STEPS * np.median(steps[steps > 0]) if (steps > 0).any() else 0.0
+    found, begin = [], 0
+    for k in np.flatnonzero(steps < 0).tolist():
+        lost, passed = -steps[k], t[k] - t[begin]
+        if k + 1 >= len(steps) or passed <= 0 or lost < RESTART * passed or not 0 <= steps[k + 1] <= ordinary:
+            return []
+        begin = k + 1
+        found.append(begin)
+    return found
+
+
+def without_repeats(t: np.ndarray) -> np.ndarray:
+    """Return the rows (K,) of ``t`` (T,) whose time is not that of the row before."""
+    return np.flatnonzero(np.concatenate([[True], np.diff(t) != 0]))
 
 
 @dataclass(frozen=True)
@@ -155,7 +218,7 @@ def recording(path: Path, importer: str, channels: dict[str, np.ndarray], **abou
     except ValidationError as error:
         lines = explain(error, "metadata", Meta.__dataclass_fields__)
         raise RecordingError("\n".join(f"{path}: {line}" for line in lines)) from error
-    result = Recording(meta, channels)
+    result = Recording(meta, channels, path)
     torques = [values for name, values in channels.items() if name.startswith("tau_est_")]
     if meta.robot == "go1" and torques and in_torque_steps(np.concatenate(torques)):
         result = replace(result, meta=replace(meta, notes="; ".join(filter(None, (meta.notes, TORQUE_NOTE)))))

@@ -1,14 +1,14 @@
-"""A file of separated values as columns of numbers; complaints name the file, the column and the line of the file."""
+"""A file of separated values, or Parquet, as columns of numbers; complaints name the file, the column and the line."""
 
 from __future__ import annotations
 
 import codecs
+import csv
 import difflib
 import json
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from go1exp.base.wording import counted
-from go1exp.logs.recording import RecordingError
+from go1exp.logs.importers.source import beginning, kind
+from go1exp.logs.recording import KEY, RecordingError
 
 UTF8 = "utf-8"
 
@@ -28,6 +29,12 @@ WITH_SIGN = {
     ".": re.compile(r"\s*[-+]?\d*\.\d+([eE][-+]?\d+)?\s*"),
 }
 """Decimal sign -> a number that is written with it."""
+
+BLOCK = 2**24
+"""Bytes of a text file that are held at a time; 16 MiB have the types of nearly all columns right."""
+
+UNIT = re.compile(r"\s*([\[(]?[^\W\d_].*|[\[(]?[°%].*|[\[(]?[-1]?[\])]?)\s*")
+"""A cell of a line of units: a word, an empty cell, 1 or a dash."""
 
 _WRONG_WIDTH = re.compile(r"Row #(\d+): Expected (\d+) columns, got (\d+)")
 """Arrow's complaint about a row; it counts lines from 1, but not the empty ones below ``skip_lines``."""
@@ -43,6 +50,7 @@ class Layout:
         delimiter: what stands between two columns.
         decimal: decimal point, or comma.
         encoding: how characters are written as bytes; a name that Python knows.
+        units: whether the line below the names has their units; found by ``read``.
     """
 
     header: bool = True
@@ -50,6 +58,7 @@ class Layout:
     delimiter: str = ","
     decimal: str = "."
     encoding: str = UTF8
+    units: bool = False
 
     @property
     def is_utf8(self) -> bool:
@@ -57,41 +66,71 @@ class Layout:
         return codecs.lookup(self.encoding).name == UTF8
 
 
-class _NoNumber(ValueError):
-    """A cell that is no number: what it is, and in which line of the file it stands."""
+@dataclass(frozen=True)
+class Table:
+    """Columns of a file.
 
-    def __init__(self, cell: Any, line: int) -> None:
-        super().__init__(f"must be numbers, but line {line} has {cell!r}")
-        self.cell, self.line = str(cell), line
+    Attributes:
+        columns: name -> (T,) numbers; a column of labels may be words.
+        unused: names of the other columns.
+        place: row from 0 -> where it stands in the file, such as ``line 12``.
+        units: name -> unit, as a line below the names gives it.
+    """
+
+    columns: dict[str, np.ndarray]
+    unused: list[str]
+    place: Callable[[int], str]
+    units: dict[str, str] = field(default_factory=dict)
+
+
+class _NoNumber(ValueError):
+    """A cell that is no number: what it is, and where it stands in the file."""
+
+    def __init__(self, cell: Any, place: str) -> None:
+        super().__init__(f"must be numbers, but {place} has {cell!r}")
+        self.cell = str(cell)
 
 
 def names(path: Path, layout: Layout) -> list[str]:
-    """Return the names of the columns: those of the first line, or 1, 2, 3."""
-    return list(_table(path, layout).column_names)
+    """Return the names of the columns: those of the first line, or 1, 2, 3; of a list, ``name[0]``, ``name[1]``."""
+    return list(_parquet_names(path)) if _is_parquet(path) else list(_text_names(path, layout))
 
 
-def read(path: Path, wanted: Mapping[str, str], layout: Layout) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Return the columns that are asked for, (T,) each, and the names of the others.
+def read(path: Path, wanted: Mapping[str, str], layout: Layout, labels: str | None = None) -> Table:
+    """Return the columns that are asked for.
 
     Args:
-        path: the file.
+        path: the file, text or Parquet.
         wanted: name of a column -> what it is for.
-        layout: how the file is written.
+        layout: how a text is written.
+        labels: column that may hold words in place of numbers.
 
     Raises:
         RecordingError: if it is no table, lacks a column, or holds what is no number; with every such column.
     """
-    table = _table(path, layout)
-    present = table.column_names
+    units: dict[str, str] = {}
+    if _is_parquet(path):
+        present = list(_parquet_names(path))
+    else:
+        given = _text_names(path, layout)
+        units = _units(path, layout, given)
+        layout = replace(layout, units=bool(units))
+        present = list(given)
     lacking = [name for name in wanted if name not in present]
     hint = _question(present[0], layout) if len(present) == 1 else _no_names(present, layout)
     # Where the delimiter is another one, or names are missing, no name is right, and one complaint will do.
     wrong = [_missing(path, name, wanted[name], present) + hint for name in (lacking[:1] if hint else lacking)]
+    there = [name for name in wanted if name in present]
+
+    def place(row: int) -> str:
+        return f"row {row}" if _is_parquet(path) else f"line {line_of(path, row, layout)}"
+
+    table = _parquet(path, there) if _is_parquet(path) else _text(path, {n: given[n] for n in there}, layout)
     values: dict[str, np.ndarray] = {}
     other_sign: list[tuple[str, _NoNumber]] = []
-    for name in [name for name in wanted if name in present]:
+    for name in there:
         try:
-            values[name] = _numbers(table.column(name), path, layout)
+            values[name] = _words(table[name]) if name == labels else _numbers(table[name], place, layout)
         except _NoNumber as error:
             if _other_sign(error.cell, layout):
                 other_sign.append((name, error))
@@ -105,13 +144,13 @@ def read(path: Path, wanted: Mapping[str, str], layout: Layout) -> tuple[dict[st
         wrong.append(f"{path}: column {name!r}{others}: {first}{_question(first.cell, layout)}")
     if wrong:
         raise RecordingError("\n".join(wrong))
-    return values, [name for name in present if name not in wanted]
+    return Table(values, [name for name in present if name not in wanted], place, units)
 
 
 def line_of(path: Path, row: int, layout: Layout) -> int:
     """Return the line of the file, from 1, of a row of numbers, from 0: empty lines are no rows."""
     rows = ((number, text) for number, text in _lines(path, layout) if text)
-    return next(islice(rows, row + int(layout.header), None), (row, ""))[0]
+    return next(islice(rows, row + layout.header + layout.units, None), (row, ""))[0]
 
 
 def _lines(path: Path, layout: Layout) -> Iterable[tuple[int, str]]:
@@ -122,32 +161,80 @@ def _lines(path: Path, layout: Layout) -> Iterable[tuple[int, str]]:
                 yield number, line.rstrip("\n")
 
 
-def _table(path: Path, layout: Layout) -> Any:
-    """Return the file as a table of Arrow, whose names have no blanks round them.
+def _text_names(path: Path, layout: Layout) -> dict[str, str]:
+    """Return the names of a text's columns without blanks round them -> the names that Arrow gives them.
 
     Raises:
         RecordingError: if it is no table, or two columns have one name.
     """
+    start = beginning(path)
+    if layout.is_utf8 and start[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+        raise RecordingError(f"{path}: is UTF-16, not UTF-8; save it as UTF-8, or give encoding: utf-16")
+    if b"\0" in start and "16" not in layout.encoding and "32" not in layout.encoding:
+        raise RecordingError(f"{path}: is binary, not text: {kind(start) or 'of a kind that is not known'}")
+    given = _arrow(path, layout, None)
+    stripped = [name.strip() for name in given] if layout.header else [str(k + 1) for k in range(len(given))]
+    twice = sorted({name for name in stripped if stripped.count(name) > 1})
+    if twice:
+        called = ", ".join(map(repr, twice))
+        raise RecordingError(f"{path}: two columns are called {called}; names must differ{_no_names(stripped, layout)}")
+    return dict(zip(stripped, given, strict=True))
+
+
+def _units(path: Path, layout: Layout, given: Mapping[str, str]) -> dict[str, str]:
+    """Return the unit of each column if the line below the names has units, and the next one numbers; else nothing."""
+    rows = csv.reader((line for _, line in _lines(path, layout) if line), delimiter=layout.delimiter)
+    below, first = ([*islice(rows, 1, 3), [], []])[:2] if layout.header else ([], [])
+    if len(below) != len(given) or not any(re.search(r"[^\W\d_]|[°%]", cell) for cell in below):
+        return {}
+    if any(not UNIT.fullmatch(c) or c.strip().lower() in ("nan", "inf", "na", "null", "true", "false") for c in below):
+        return {}
+    if not first or any(re.search(r"\d", c) is None for c in first if c.strip()):
+        return {}
+    return dict(zip(given, (cell.strip() for cell in below), strict=True))
+
+
+def _text(path: Path, wanted: Mapping[str, str], layout: Layout) -> dict[str, Any]:
+    """Return columns of a text as Arrow has them; ``wanted`` is our name -> Arrow's name."""
+    table = _arrow(path, layout, list(wanted.values()))
+    if table.num_rows == 0:
+        raise RecordingError(f"{path}: has no rows of numbers")
+    return {ours: table.column(theirs) for ours, theirs in wanted.items()}
+
+
+def _arrow(path: Path, layout: Layout, wanted: list[str] | None) -> Any:
+    """Return columns of a text as a table of Arrow; with None for ``wanted``, the names of all.
+
+    Raises:
+        RecordingError: if it is no table.
+    """
     import pyarrow as pa
     from pyarrow import csv as arrow_csv
 
-    # One block, so that Arrow sees the whole column before it chooses a type: 0 in the first rows may be 0.5 later.
+    parse = arrow_csv.ParseOptions(delimiter=layout.delimiter)
+    convert = arrow_csv.ConvertOptions(decimal_point=layout.decimal, include_columns=wanted)
+
+    def options(block: int) -> Any:
+        return arrow_csv.ReadOptions(
+            use_threads=False,
+            block_size=block,
+            skip_rows=layout.skip_lines,
+            skip_rows_after_names=int(layout.units),
+            autogenerate_column_names=not layout.header,
+            encoding="utf8" if layout.is_utf8 else layout.encoding,
+        )
+
     # A character of another encoding may take up to three bytes of UTF-8, which Arrow makes of it.
     size = path.stat().st_size * (1 if layout.is_utf8 else 3) + 1
-    options = arrow_csv.ReadOptions(
-        use_threads=False,
-        block_size=min(max(size, 2**20), 2**31 - 1),
-        skip_rows=layout.skip_lines,
-        autogenerate_column_names=not layout.header,
-        encoding="utf8" if layout.is_utf8 else layout.encoding,
-    )
-    parse = arrow_csv.ParseOptions(delimiter=layout.delimiter)
-    convert = arrow_csv.ConvertOptions(decimal_point=layout.decimal)
     try:
-        if layout.is_utf8:
-            _refuse_utf16(path)
-        table = arrow_csv.read_csv(path, options, parse, convert)
-        given = list(table.column_names)
+        try:
+            reader = arrow_csv.open_csv(path, options(BLOCK), parse, convert)
+            return reader.schema.names if wanted is None else reader.read_all()
+        except pa.ArrowInvalid:
+            if size <= BLOCK:
+                raise
+            # One block, so that Arrow sees the whole column before it chooses a type: 0 at first may be 0.5 later.
+            return arrow_csv.read_csv(path, options(min(size, 2**31 - 1)), parse, convert)
     except UnicodeError:
         raise RecordingError(
             f"{path}: has characters that are not {layout.encoding.upper()}; save it as UTF-8, "
@@ -156,24 +243,67 @@ def _table(path: Path, layout: Layout) -> Any:
     except (pa.ArrowException, OSError) as error:
         why = _uneven(path, str(error), layout) or f"not a table of numbers ({str(error).splitlines()[0]})"
         raise RecordingError(f"{path}: {why}") from error
-    if not layout.header:
-        given = [str(k + 1) for k in range(table.num_columns)]
-    stripped = [name.strip() for name in given]
-    twice = sorted({name for name in stripped if stripped.count(name) > 1})
-    if twice:
-        called = ", ".join(map(repr, twice))
-        raise RecordingError(f"{path}: two columns are called {called}; names must differ{_no_names(stripped, layout)}")
-    if table.num_rows == 0:
+
+
+# ---------------------------------------------------------------------- Parquet
+
+
+def _is_parquet(path: Path) -> bool:
+    return beginning(path)[:4] == b"PAR1"
+
+
+def _parquet_names(path: Path) -> dict[str, tuple[str, int | None, int]]:
+    """Return the names of the columns -> column in the file, place in its lists (None: no list), length of these.
+
+    The first row has the lengths of lists.
+
+    Raises:
+        RecordingError: if it is damaged, has no rows, or is a recording.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        with pq.ParquetFile(path) as file:
+            if KEY in (file.metadata.metadata or {}):
+                raise RecordingError(f"{path}: is a recording already; there is nothing to import")
+            first = next(file.iter_batches(batch_size=1), None)
+    except (pa.ArrowException, OSError) as error:
+        raise RecordingError(f"{path}: not a whole Parquet file ({str(error).splitlines()[0]})") from error
+    if first is None or first.num_rows == 0:
         raise RecordingError(f"{path}: has no rows of numbers")
-    return table.rename_columns(stripped)
+    found: dict[str, tuple[str, int | None, int]] = {}
+    for name, (value,) in first.to_pydict().items():
+        if isinstance(value, list):
+            found |= {f"{name}[{k}]": (name, k, len(value)) for k in range(len(value))}
+        else:
+            found[name] = (name, None, 0)
+    return found
 
 
-def _refuse_utf16(path: Path) -> None:
-    """Raise RecordingError if a file begins as UTF-16 does."""
-    with path.open("rb") as file:
-        start = file.read(2)
-    if start in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
-        raise RecordingError(f"{path}: is UTF-16, not UTF-8; save it as UTF-8, or give encoding: utf-16")
+def _parquet(path: Path, wanted: Iterable[str]) -> dict[str, Any]:
+    """Return columns of a Parquet file as Arrow has them, elements of lists as columns of their own."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    source = {name: place for name, place in _parquet_names(path).items() if name in set(wanted)}
+    try:
+        table = pq.read_table(path, columns=list(dict.fromkeys(name for name, *_ in source.values())))
+    except (pa.ArrowException, OSError) as error:
+        raise RecordingError(f"{path}: not a whole Parquet file ({str(error).splitlines()[0]})") from error
+    columns = {}
+    for ours, (name, k, width) in source.items():
+        column = table.column(name).combine_chunks()
+        if k is not None:
+            lengths = np.asarray(column.value_lengths().fill_null(0)) if hasattr(column, "value_lengths") else width
+            if np.any(lengths != width) or column.null_count:
+                raise RecordingError(f"{path}: column {name!r}: its lists are not all of {width} elements, as row 0's")
+            column = column.flatten()[k::width]
+        columns[ours] = pa.chunked_array([column])
+    return columns
+
+
+# ---------------------------------------------------------------------- complaints
 
 
 def _uneven(path: Path, message: str, layout: Layout) -> str | None:
@@ -234,33 +364,45 @@ def _question(text: str, layout: Layout) -> str:
     return f"; is the delimiter {other!r}, and the decimal {sign!r}? {give} and decimal: {json.dumps(sign)}"
 
 
-def _numbers(column: Any, path: Path, layout: Layout) -> np.ndarray:
+def _words(column: Any) -> np.ndarray:
+    """Return a column of labels (T,), words or numbers.
+
+    Raises:
+        ValueError: if a cell is empty.
+    """
+    if column.null_count:
+        raise ValueError(f"{counted(column.null_count, 'cell')} without a label")
+    return np.asarray(column.to_numpy())
+
+
+def _numbers(column: Any, place: Callable[[int], str], layout: Layout) -> np.ndarray:
     """Return a column of Arrow (T,), float64 or whole numbers.
 
     Raises:
-        ValueError: if a cell is empty or is no finite number; with the line of the first such cell.
+        ValueError: if a cell is empty or is no finite number; with the place of the first such cell.
     """
     import pyarrow as pa
 
-    at = partial(line_of, path, layout=layout)
     if pa.types.is_boolean(column.type) or pa.types.is_integer(column.type) or pa.types.is_floating(column.type):
         empty = np.flatnonzero(column.is_null().to_numpy())
         if empty.size:
             cells, verb = counted(empty.size, "cell"), "is" if empty.size == 1 else "are"
-            raise ValueError(f"{cells} {verb} empty or NaN, the first in line {at(int(empty[0]))}; leave such rows out")
-        if pa.types.is_boolean(column.type):
-            column = column.cast(pa.uint8())
+            where = place(int(empty[0]))
+            raise ValueError(f"{cells} {verb} empty or NaN, the first in {where}; leave such rows out")
+        if pa.types.is_boolean(column.type) or pa.types.is_unsigned_integer(column.type):
+            column = column.cast(pa.int64())  # differences of unsigned numbers would overflow
         numbers: np.ndarray = column.to_numpy()  # whole numbers stay whole: float64 cannot hold ns since 1970
         strange = np.flatnonzero(~np.isfinite(numbers))
         if strange.size:
             first = int(strange[0])
-            raise ValueError(f"{numbers[first]} in line {at(first)}; every value must be finite")
-        return numbers
-    for row, cell in enumerate(column.to_pylist()):
+            raise ValueError(f"{numbers[first]} in {place(first)}; every value must be finite")
+        return numbers.astype(np.float64) if numbers.dtype.kind == "f" else numbers
+    for row, value in enumerate(column):
+        cell = value.as_py()
         try:
             if _other_sign(str(cell), layout):
                 raise ValueError
             float(cell.replace(layout.decimal, ".") if isinstance(cell, str) else cell)
         except (TypeError, ValueError):
-            raise _NoNumber(cell, at(row)) from None
+            raise _NoNumber(cell, place(row)) from None
     raise ValueError(f"must be numbers, but is read as {column.type}")

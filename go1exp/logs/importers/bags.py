@@ -1,0 +1,356 @@
+"""MCAP logs of ROS 2: reading their messages, choosing one source of a topic, and columns of what joints report."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from go1exp.base.wording import counted
+from go1exp.config.schema.registry import explain
+from go1exp.logs.importers.source import beginning, joint_columns, kind, without_repeats
+from go1exp.logs.recording import RecordingError
+from go1exp.robot import JOINTS
+
+EXTRA = 'pip install "go1exp[logs]"'
+
+MOSTLY = 0.9
+"""Share of the messages that must have a field for those without it to be left out, not the field (chosen)."""
+HOLE = 1.5
+"""Step, in median ones, from which a message is missing (chosen: between one step and two)."""
+
+
+class Decoded(BaseModel):
+    """A message, read by the names of its fields, whether it came as an object or as JSON."""
+
+    model_config = ConfigDict(from_attributes=True)
+
+
+@dataclass(frozen=True)
+class State:
+    """What one message says of joints.
+
+    Attributes:
+        log_ns: time of logging, ns.
+        stamp_ns: time of its header, ns; 0 if it has none.
+        source: what tells publishers of one topic apart.
+        names: joints.
+        fields: ``position``, ``velocity`` and ``effort``, one value for each joint, or none.
+        message: all of it.
+    """
+
+    log_ns: int
+    stamp_ns: int
+    source: tuple[Any, ...]
+    names: tuple[str, ...]
+    fields: Mapping[str, Sequence[float]]
+    message: Any
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A type of message: its names, its fields, and what it says of joints: ``State``'s stamp_ns, source, names, fields."""
+
+    types: tuple[str, ...]
+    model: type[Decoded]
+    joints: Callable[[Any], tuple[int, tuple[Any, ...], tuple[str, ...], Mapping[str, Sequence[float]]]]
+
+
+# ---------------------------------------------------------------------- the file
+
+
+def read(path: Path, topics: Mapping[str, Kind], cut: bool) -> tuple[dict[str, list[State]], list[str]]:
+    """Return the messages of topics, each in the order of logging and at least one, and notes.
+
+    Args:
+        path: the log.
+        topics: topic -> type of its messages.
+        cut: whether the readable part of a damaged log will do.
+
+    Raises:
+        RecordingError: if the extra is not installed, the log is damaged or of another kind, or a topic is missing.
+    """
+    try:
+        from mcap.exceptions import UnsupportedCompressionError
+        from mcap.reader import make_reader
+        from mcap.stream_reader import StreamReader
+        from mcap_ros2.decoder import DecoderFactory
+    except ImportError as error:
+        raise RecordingError(f"{path}: to read MCAP, {EXTRA} ({error})") from error
+    start = beginning(path)
+    if not start.startswith(b"\x89MCAP0") and (what := kind(start)):
+        raise RecordingError(f"{path}: is {what}")
+    states: dict[str, list[State]] = {topic: [] for topic in topics}
+    found: set[str] = set()
+    notes: list[str] = []
+    factory, decoders = DecoderFactory(), {}
+
+    def add(schema: Any, channel: Any, message: Any) -> None:
+        of, where = states[channel.topic], f"{path}: {channel.topic}"
+        if channel.id not in decoders:
+            decoders[channel.id] = _decoder(where, factory, schema, channel.message_encoding, topics[channel.topic])
+        content = _checked(f"{where}: message {len(of)}", topics[channel.topic], decoders[channel.id], message.data)
+        stamp, source, names, fields = topics[channel.topic].joints(content)
+        of.append(State(message.log_time, stamp, (channel.id, *source), names, fields, content))
+
+    try:
+        with path.open("rb") as file:
+            reader = make_reader(file, validate_crcs=True)
+            summary = reader.get_summary()
+            found = {channel.topic for channel in summary.channels.values()} if summary else set()
+            for each in reader.iter_messages(topics=list(topics)):
+                add(*each)
+    except RecordingError:
+        raise
+    except UnsupportedCompressionError as error:
+        raise RecordingError(f"{path}: its chunks are compressed; to read them, pip install {error}") from error
+    except Exception as error:  # the reader and its decompressors share no base class of errors
+        for of in states.values():
+            of.clear()
+        found.clear()
+        with path.open("rb") as file:
+            for schema, channel, message in _until_the_cut(StreamReader(file, validate_crcs=True).records):
+                found.add(channel.topic)
+                if channel.topic in topics:
+                    add(schema, channel, message)
+        for of in states.values():
+            of.sort(key=lambda state: state.log_ns)
+        whole = f"{path}: not a whole MCAP file ({error or type(error).__name__})"
+        readable = [f"{len(of)} of {topic}" for topic, of in states.items() if of]
+        if not readable:
+            raise RecordingError(f"{whole}; no message of {' or '.join(topics)} is readable") from error
+        if not cut:
+            last = max(of[-1].log_ns for of in states.values() if of)
+            seconds = (last - min(of[0].log_ns for of in states.values() if of)) / 1e9
+            raise RecordingError(
+                f"{whole}; its first {seconds:.3g} s are readable (messages: {', '.join(readable)}): import them by "
+                f"cut: true, or recover the file: mcap recover {path.name} -o whole.mcap (of the mcap tool)"
+            ) from error
+        notes.append("The log is cut or damaged; this is its readable part.")
+    for topic, of in states.items():
+        if not of:
+            raise RecordingError(f"{path}: no message on topic {topic!r}; it has {', '.join(sorted(found)) or 'none'}")
+    return states, notes
+
+
+def _until_the_cut(records: Iterator[Any]) -> Iterator[tuple[Any, Any, Any]]:
+    """Yield schema, channel and message up to where a log cannot be read any further."""
+    from mcap.records import Channel, Message, Schema
+
+    schemas: dict[int, Any] = {}
+    channels: dict[int, Any] = {}
+    while True:
+        try:
+            record = next(records)
+        except Exception:  # noqa: BLE001  (the end, or whatever a reader or decompressor meets in a damaged file)
+            return
+        if isinstance(record, Schema):
+            schemas[record.id] = record
+        elif isinstance(record, Channel):
+            channels[record.id] = record
+        elif isinstance(record, Message) and record.channel_id in channels:
+            channel = channels[record.channel_id]
+            yield schemas.get(channel.schema_id), channel, record
+
+
+def _decoder(where: str, factory: Any, schema: Any, encoding: str, wanted: Kind) -> Callable[[bytes], Any]:
+    if encoding == "json":
+        return json.loads
+    if encoding == "ros1":
+        raise RecordingError(
+            f"{where}: has messages of ROS 1; make a bag of ROS 2: rosbags-convert of the package rosbags"
+        )
+    if schema is None or schema.name not in wanted.types:
+        name = schema.name if schema else "without a type"
+        lowstate = "; import it with unitree_lowstate_go1 or _go2" if name.endswith("/LowState") else ""
+        raise RecordingError(f"{where}: must be {wanted.types[0]}, not {name}{lowstate}")
+    decode: Callable[[bytes], Any] | None = factory.decoder_for(encoding, schema)
+    if decode is None:
+        raise RecordingError(f"{where}: {encoding} with a {schema.encoding} schema; cdr with ros2msg, or json, is read")
+    return decode
+
+
+def _checked(where: str, wanted: Kind, decode: Callable[[bytes], Any], data: bytes) -> Decoded:
+    if data[:4] == b"\x28\xb5\x2f\xfd":  # ros2 bag record --compression-mode message
+        import zstandard
+
+        data = zstandard.ZstdDecompressor().decompressobj().decompress(data)
+    try:
+        return wanted.model.model_validate(decode(data))
+    except ValidationError as error:
+        raise RecordingError("\n".join(f"{where}: {line}" for line in explain(error, "", ()))) from error
+
+
+# ---------------------------------------------------------------------- one source
+
+
+def joints_of(states: Sequence[State]) -> tuple[str, ...]:
+    """Return the joints of the source that moves, and of these of that with the most messages; a Go1's in our order."""
+    groups: dict[tuple[str, ...], list[State]] = {}
+    for state in states:
+        if state.fields["position"]:
+            groups.setdefault(state.names, []).append(state)
+    names = max(groups, key=lambda key: _rank(groups[key]), default=states[0].names)
+    return JOINTS if set(names) == set(JOINTS) else names
+
+
+def _rank(states: Sequence[State]) -> tuple[bool, int]:
+    return any(s.fields["position"] != states[0].fields["position"] for s in states), len(states)
+
+
+def one_source(
+    path: Path, topic: str, states: Sequence[State], joints: Sequence[str], notes: list[str], *, measured: bool
+) -> list[State]:
+    """Return the messages of one source that has the joints, and note what is left out.
+
+    Messages may list joints in another order, or lack a field, now and then. Where they come between regular ones, in
+    place of none, they are another publisher's.
+
+    Raises:
+        RecordingError: if no message has all joints, or one has a wrong number of values.
+    """
+    where, groups = f"{path}: {topic}", dict[tuple[Any, ...], list[State]]()
+    for i, state in enumerate(states):
+        for key, values in state.fields.items():
+            if len(values) not in (0, len(state.names)):
+                names = len(state.names)
+                raise RecordingError(f"{where}: message {i} has {names} names, but {len(values)} of {key}")
+        filled = tuple(bool(values) for values in state.fields.values())
+        zero = measured and not any(state.fields["position"])
+        groups.setdefault((state.names, state.source, filled, zero), []).append(state)
+    able = {key: of for key, of in groups.items() if set(joints) <= set(key[0]) and (key[2][0] or not measured)}
+    if not able and any(set(joints) <= set(key[0]) for key in groups):
+        raise RecordingError(f"{where}: its messages hold no position")
+    if not able:
+        number = Counter(state.names for state in states)
+        present = "; ".join(f"{counted(n, 'message')} of ({', '.join(names)})" for names, n in number.items())
+        known = {name for key in groups for name in key[0]}
+        lacking = [joint for joint in joints if joint not in known]
+        why = f"lacks joint {', '.join(lacking)}" if lacking else "has all of the joints in no single message"
+        raise RecordingError(f"{where}: {why}; it has {present}")
+    main = max(able, key=lambda key: _rank(able[key]))
+    clock = np.array([s.log_ns for s in able[main]], np.int64)
+    taken, left = list(able[main]), Counter[str]()
+    for key, of in groups.items():
+        if key == main:
+            continue
+        if key in able and not _between(clock, np.array([s.log_ns for s in of], np.int64)):
+            taken += of
+        else:
+            what = "all of them zero, " if key in able and key[3] else ""
+            source = "a second source of these joints" if key in able else "another source"
+            left[f"{source} ({what}{', '.join(key[0])})"] += len(of)
+    notes += [f"{topic}: {counted(n, 'message')} of {source} left out." for source, n in left.items()]
+    order = {id(state): i for i, state in enumerate(states)}
+    return sorted(taken, key=lambda state: order[id(state)])
+
+
+def _between(clock: np.ndarray, times: np.ndarray) -> bool:
+    """Return whether most ``times`` (K,) lie between regular steps of a ``clock`` (N,), where none is missing."""
+    if len(clock) < 3:
+        return False
+    after = np.searchsorted(clock, times)
+    inside = (after > 0) & (after < len(clock))
+    after = np.clip(after, 1, len(clock) - 1)
+    gap = clock[after] - clock[after - 1]
+    return bool(np.mean(inside & (gap < HOLE * np.median(np.diff(clock)))) > 0.5)
+
+
+# ---------------------------------------------------------------------- columns
+
+
+def channels(
+    path: Path,
+    states: Mapping[str, Sequence[State]],
+    state_topic: str,
+    command_topic: str | None,
+    joints: tuple[str, ...],
+    drop_repeats: bool,
+    notes: list[str],
+) -> tuple[dict[str, np.ndarray], list[State]]:
+    """Return the columns in the order of ``joints``, and the message of each row; append to the notes.
+
+    Commands are held from one to the next; rows before the first one are left out.
+    """
+    chosen = {
+        topic: one_source(path, topic, of, joints, notes, measured=topic == state_topic) for topic, of in states.items()
+    }
+    blocks = {topic: _blocks(topic, of, joints, notes) for topic, of in chosen.items()}
+    chosen = {topic: of for topic, (of, _) in blocks.items()}
+    # Header stamps are when the state was measured, log times when it was written. One kind for all messages.
+    stamped = all(s.stamp_ns > 0 for of in chosen.values() for s in of)
+    clock = {k: np.array([s.stamp_ns if stamped else s.log_ns for s in of], np.int64) for k, of in chosen.items()}
+    now, rows = clock[state_topic], np.arange(len(clock[state_topic]))
+    notes.insert(0, f"t = 0 is {now[0]} ns of {'the header stamps' if stamped else 'the log'}.")
+    if not stamped and any(s.stamp_ns for of in chosen.values() for s in of):
+        notes.append("Some messages have no header stamp, so t is the time of logging.")
+    fresh = without_repeats(now)
+    if drop_repeats and len(fresh) < len(now):
+        notes.append(f"{counted(len(now) - len(fresh), 'message')} with the time of the one before: left out.")
+        now, rows = now[fresh], rows[fresh]
+    elif len(fresh) < len(now) and (np.diff(now) >= 0).all():
+        twice = counted(len(now) - len(fresh), "message")
+        raise RecordingError(
+            f"{path}: {state_topic}: t: must increase strictly, but row {_first_repeat(now)} has the time of the one "
+            f"before ({twice}); leave such out by drop_repeats: true, unless they are another publisher's"
+        )
+    columns = {"t": (now - now[0]) / 1e9}  # from integers: float64 cannot hold ns since 1970
+    for quantity, key in (("q", "position"), ("qd", "velocity"), ("tau_est", "effort")):
+        if key in blocks[state_topic][1]:
+            columns |= joint_columns(quantity, joints, blocks[state_topic][1][key][rows])
+    kept = [chosen[state_topic][k] for k in rows]
+    if command_topic is None:
+        return columns, kept
+    if (np.diff(clock[command_topic]) < 0).any():
+        raise RecordingError(f"{path}: {command_topic}: time runs backwards")
+    # index of the command in force at each state; -1 before the first
+    held = np.searchsorted(clock[command_topic], now, side="right") - 1
+    use = held >= 0
+    if not use.any():
+        raise RecordingError(f"{path}: {command_topic}: its first command comes after the last state")
+    for quantity, key in (("q_target", "position"), ("tau_cmd", "effort")):
+        if key in blocks[command_topic][1]:
+            columns |= joint_columns(quantity, joints, blocks[command_topic][1][key][held])
+    if not use.all():
+        notes.append(f"The {int((~use).sum())} states before the first command are left out.")
+    return {k: v[use] for k, v in columns.items()}, [s for s, u in zip(kept, use, strict=True) if u]
+
+
+def _first_repeat(now: np.ndarray) -> int:
+    return int(np.flatnonzero(np.diff(now) == 0)[0]) + 1
+
+
+def _blocks(
+    topic: str, states: Sequence[State], joints: Sequence[str], notes: list[str]
+) -> tuple[Sequence[State], dict[str, np.ndarray]]:
+    """Return messages that have all fields that are used, and field -> (T, J).
+
+    A field is not used if it is empty in more than a few messages, or zero or NaN in all (positions are used).
+    """
+    used = []
+    for key in states[0].fields:
+        filled = sum(bool(s.fields[key]) for s in states)
+        if filled >= MOSTLY * len(states):
+            used.append(key)
+        elif filled:
+            notes.append(f"{key} of {topic} is in {filled} of {len(states)} messages only and is left out.")
+    whole = [s for s in states if all(s.fields[key] for key in used)]
+    if len(whole) < len(states):
+        notes.append(
+            f"{counted(len(states) - len(whole), 'message')} of {topic} without {' or '.join(used)}: left out."
+        )
+    orders = {names: [names.index(joint) for joint in joints] for names in {s.names for s in whole}}
+    blocks = {}
+    for key in used:
+        block = np.array([[s.fields[key][j] for j in orders[s.names]] for s in whole], np.float64)
+        if key != "position" and (np.isnan(block) | (block == 0)).all():
+            notes.append(f"{key} of {topic} is zero or NaN throughout and is left out.")
+        else:
+            blocks[key] = block
+    return whole, blocks

@@ -1,0 +1,219 @@
+"""Unitree's own ``LowState`` of a Go1 or Go2, and its ``LowCmd``, in an MCAP log; needs the extra ``logs``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import AliasChoices, Field
+
+from go1exp.config.schema.registry import Positive, importer
+from go1exp.logs.importers import bags
+from go1exp.logs.importers.source import columns, files, recording
+from go1exp.logs.recording import FOOT_FORCE, VECTORS, Quaternion, Recording, RecordingError
+from go1exp.robot import JOINTS, LEGS
+
+PACKAGES = ("unitree_go", "ros2_unitree_legged_msgs", "unitree_legged_msgs")
+"""Packages of ROS 2 that have these messages, of the Go2 first."""
+
+STOP = 1e6
+"""rad; the value by which a command says that it has no target, 2.146e9, lies above it."""
+
+Vector = Annotated[tuple[float, ...], Field(min_length=3, max_length=3)]
+
+
+def _either(snake: str, camel: str) -> Any:
+    return Field(validation_alias=AliasChoices(snake, camel))
+
+
+class _Motor(bags.Decoded):
+    q: float
+    dq: float
+    tau_est: float = _either("tau_est", "tauEst")
+
+
+class _Imu(bags.Decoded):
+    quaternion: Quaternion
+    gyroscope: Vector
+    accelerometer: Vector
+
+
+class _LowState(bags.Decoded):
+    motor_state: tuple[_Motor, ...] = _either("motor_state", "motorState")
+    imu_state: _Imu | None = Field(None, validation_alias=AliasChoices("imu_state", "imu"))
+    foot_force: tuple[float, ...] = Field((), validation_alias=AliasChoices("foot_force", "footForce"))
+    tick: int = 0
+
+
+class _MotorCommand(bags.Decoded):
+    q: float
+    kp: float = _either("kp", "Kp")
+    kd: float = _either("kd", "Kd")
+
+
+class _LowCmd(bags.Decoded):
+    motor_cmd: tuple[_MotorCommand, ...] = _either("motor_cmd", "motorCmd")
+
+
+Joints = tuple[int, tuple[Any, ...], tuple[str, ...], Mapping[str, Sequence[float]]]
+
+
+def _state(message: _LowState) -> Joints:
+    motors = message.motor_state[: len(JOINTS)]  # the others are not used
+    values = {"position": "q", "velocity": "dq", "effort": "tau_est"}
+    return 0, (), JOINTS[: len(motors)], {k: [getattr(m, name) for m in motors] for k, name in values.items()}
+
+
+def _command(message: _LowCmd) -> Joints:
+    motors = message.motor_cmd[: len(JOINTS)]
+    return 0, (), JOINTS[: len(motors)], {"position": [m.q for m in motors]}
+
+
+STATE = bags.Kind(tuple(f"{package}/msg/LowState" for package in PACKAGES), _LowState, _state)
+COMMAND = bags.Kind(tuple(f"{package}/msg/LowCmd" for package in PACKAGES), _LowCmd, _command)
+
+
+@importer("unitree_lowstate_go1")
+def unitree_lowstate_go1(
+    path: Path,
+    *,
+    state_topic: str = "/low_state",
+    command_topic: str | None = None,
+    base: Literal["fixed", "floating"] = "floating",
+    base_quat: Quaternion | None = None,
+    foot_newton: Positive | None = None,
+    foot_zero: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
+    excitation: str | None = None,
+    drop_repeats: bool = False,
+    cut: bool = False,
+) -> list[Recording]:
+    """LowState, and LowCmd if there is any, of a Unitree Go1 from the MCAP log of a ROS 2 node.
+
+    Motors 0 to 11 are FR, FL, RR, RL x hip, thigh, calf: our order. Commands are held from one to the next; their gains
+    are those of the recording if they never change. t is the time of logging, as the message has no stamp.
+
+    Args:
+        path: a ``.mcap``, or a folder of them.
+        state_topic: topic of LowState.
+        command_topic: topic of LowCmd; None if there is none.
+        base: whether the base was ``fixed`` or ``floating``.
+        base_quat: attitude of a fixed base, w-x-y-z.
+        foot_newton: force of one count of ``foot_force``, N; null leaves the feet out, as counts have no unit.
+        foot_zero: counts of each unloaded foot, FR, FL, RR, RL.
+        excitation: name of the motion.
+        drop_repeats: leave out messages with the time of the one before; the notes have their number.
+        cut: import the readable part of a damaged log.
+
+    Raises:
+        RecordingError: if the extra is not installed, the log is damaged, or a topic or motor is missing.
+    """
+    about = {"robot": "go1", "base": base, "base_quat": base_quat, "excitation": excitation}
+    foot = (foot_newton, foot_zero)
+    return [_one(file, state_topic, command_topic, foot, drop_repeats, cut, about) for file in files(path, "*.mcap")]
+
+
+@importer("unitree_lowstate_go2")
+def unitree_lowstate_go2(
+    path: Path,
+    *,
+    state_topic: str = "/lowstate",
+    command_topic: str | None = None,
+    base: Literal["fixed", "floating"] = "floating",
+    base_quat: Quaternion | None = None,
+    foot_newton: Positive | None = None,
+    foot_zero: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
+    excitation: str | None = None,
+    drop_repeats: bool = False,
+    cut: bool = False,
+) -> list[Recording]:
+    """LowState, and LowCmd if there is any, of a Unitree Go2 from an MCAP log: ``ros2 bag record -s mcap /lowstate``.
+
+    The Go2 has the joints of the Go1 in the same order, on 12 of 20 motors; they get our names. ``robot`` is ``go2``.
+
+    Args:
+        path: a ``.mcap``, or a folder of them.
+        state_topic: topic of LowState.
+        command_topic: topic of LowCmd, such as /lowcmd; None if there is none.
+        base: whether the base was ``fixed`` or ``floating``.
+        base_quat: attitude of a fixed base, w-x-y-z.
+        foot_newton: force of one count of ``foot_force``, N; null leaves the feet out, as counts have no unit.
+        foot_zero: counts of each unloaded foot, FR, FL, RR, RL.
+        excitation: name of the motion.
+        drop_repeats: leave out messages with the time of the one before; the notes have their number.
+        cut: import the readable part of a damaged log.
+
+    Raises:
+        RecordingError: if the extra is not installed, the log is damaged, or a topic or motor is missing.
+    """
+    about = {"robot": "go2", "base": base, "base_quat": base_quat, "excitation": excitation}
+    foot = (foot_newton, foot_zero)
+    return [_one(file, state_topic, command_topic, foot, drop_repeats, cut, about) for file in files(path, "*.mcap")]
+
+
+def _one(
+    path: Path,
+    state_topic: str,
+    command_topic: str | None,
+    foot: tuple[float | None, Sequence[float]],
+    drop_repeats: bool,
+    cut: bool,
+    about: Mapping[str, Any],
+) -> Recording:
+    """Return one log as a recording."""
+    topics = {state_topic: STATE} | ({command_topic: COMMAND} if command_topic else {})
+    states, notes = bags.read(path, topics, cut)
+    for topic, of in states.items():
+        motors = min(len(state.names) for state in of)
+        if motors < len(JOINTS):
+            raise RecordingError(
+                f"{path}: {topic}: a message has {motors} motors; a {about['robot']} has {len(JOINTS)}"
+            )
+    gains: dict[str, tuple[float, ...]] = {}
+    if command_topic:
+        commands = [state for state in states[command_topic] if max(map(abs, state.fields["position"])) < STOP]
+        if left := len(states[command_topic]) - len(commands):
+            notes.append(f"{left} commands of {command_topic} have no target of the angle (2.146e9) and are left out.")
+        if not commands:
+            raise RecordingError(f"{path}: {command_topic}: no command has a target of every angle")
+        states[command_topic] = commands
+        for name in ("kp", "kd"):
+            used = {tuple(getattr(m, name) for m in s.message.motor_cmd[: len(JOINTS)]) for s in commands}
+            if len(used) == 1:
+                gains[name] = tuple(float(f"{value:.7g}") for value in used.pop())  # float32 of the message
+            else:
+                notes.append(f"{name} of {command_topic} changes, so that the recording has none.")
+    channels, kept = bags.channels(path, states, state_topic, command_topic, JOINTS, drop_repeats, notes)
+    messages = [state.message for state in kept]
+    for quantity, field in (("imu_quat", "quaternion"), ("imu_gyro", "gyroscope"), ("imu_acc", "accelerometer")):
+        if any(message.imu_state is None for message in messages):
+            continue
+        block = np.array([getattr(message.imu_state, field) for message in messages], np.float64)
+        if block.any():
+            channels |= columns(VECTORS[quantity], block)
+        else:
+            notes.append(f"{field} is zero throughout and is left out.")
+    newton, zero = foot
+    counts = [message.foot_force for message in messages]
+    if newton is not None and all(len(each) == len(LEGS) for each in counts):
+        forces = newton * (np.array(counts) - zero)
+        channels |= columns((FOOT_FORCE + leg for leg in LEGS), forces)
+        notes.append(f"foot_force = {newton:g} N (counts - {list(zero)}).")
+    elif any(any(each) for each in counts):
+        notes.append("foot_force is in counts without a unit and is left out; foot_newton and foot_zero calibrate it.")
+    notes.append(_ticks(np.array([message.tick for message in messages]), channels["t"]))
+    return recording(
+        path, f"unitree_lowstate_{about['robot']}", channels, joints=JOINTS, notes=" ".join(notes), **gains, **about
+    )
+
+
+def _ticks(tick: np.ndarray, t: np.ndarray) -> str:
+    """Return what the robot's own counter (T,) says of the times of logging (T,), s."""
+    steps = np.diff(tick)
+    if not steps.any() or t[-1] <= t[0]:
+        return "The message has no tick that counts."
+    if (steps < 0).any():
+        return "Its tick begins anew within the log."
+    rate = (tick[-1] - tick[0]) / (t[-1] - t[0])
+    return f"Its tick counts {rate:.4g} a second by these times; {int((steps == 0).sum())} messages repeat a tick."
