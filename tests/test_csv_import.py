@@ -360,7 +360,7 @@ def test_a_wrong_file_of_columns_is_told(tmp_path: Path, text: str | None, said:
 ARM = ["record", "import", "csv", "one", "options=lä/arm.yaml"]
 
 
-def test_what_an_import_replaces_is_told_and_two_files_of_one_name_are_refused(tmp_path: Path) -> None:
+def test_what_an_import_replaces_is_told_and_two_files_of_one_name_are_renamed(tmp_path: Path) -> None:
     for folder in ("one", "two", "lä"):
         (tmp_path / folder).mkdir()
     (tmp_path / "lä" / "arm.yaml").write_text("robot: arm\ncolumns: {t: {column: stamp, unit: ms}, q_knee: goal}\n")
@@ -373,9 +373,8 @@ def test_what_an_import_replaces_is_told_and_two_files_of_one_name_are_refused(t
         "note: o holds a.parquet of an earlier call; new ones replace them (or: out=FOLDER)\n"
     )
     both = run(tmp_path, *ARM[:3], ".", ARM[4], "out=both")
-    assert both.returncode != 0
-    assert "two files in it would both be a.parquet" in both.stderr
-    assert not (tmp_path / "both").exists()
+    assert both.returncode == 0
+    assert sorted(p.name for p in (tmp_path / "both").iterdir()) == ["one_a.parquet", "two_a.parquet"]
 
 
 def test_an_import_asks_for_the_unit_of_short_steps(tmp_path: Path) -> None:
@@ -417,3 +416,40 @@ def test_an_import_asks_for_the_unit_of_long_steps(tmp_path: Path, factor: float
     line = "note: a: t steps by 4 s (median); a log of joints must step by at most 0.1 s. Is it in milliseconds?"
     assert (line in done.stdout) == noted
     assert ("unit: ms" in done.stdout) == noted
+
+
+def test_a_clock_that_begins_anew_and_a_column_of_episodes_separate_recordings(tmp_path: Path) -> None:
+    t = [0.0, 0.01, 0.02, 0.03]
+    rows = [f"{e},{s},{10 * e + k}" for e in (0, 1) for k, s in enumerate(t)]
+    (tmp_path / "a.csv").write_text("\n".join(["run,t,q", *rows]) + "\n")
+    options = {"robot": "arm", "columns": {"t": "t", "q_knee": "q"}}
+    for more in ({}, {"episode": "run"}):
+        read = import_recordings("csv", tmp_path / "a.csv", options | more)
+        assert [r.meta.episode for r in read] == ["a_0", "a_1"]
+        assert read[1].channels["q_knee"].tolist() == [10.0, 11.0, 12.0, 13.0]
+        assert read[1].t == pytest.approx(t)
+
+
+def test_lists_in_parquet_are_the_joints(tmp_path: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    state = [[float(k), 10.0 + k] for k in range(4)]
+    table = pa.table({"timestamp": [0.0, 0.1, 0.2, 0.3], "observation.state": state})
+    pq.write_table(table, tmp_path / "a.parquet")
+    columns = {"t": "timestamp", "q": "observation.state"}
+    (r,) = import_recordings("csv", tmp_path, {"robot": "arm", "joints": ["a", "b"], "columns": columns})
+    assert r.joint("q").tolist() == state
+
+
+def test_a_line_of_units_repeats_and_binary_files(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("t,q\nms,deg\n0,0\n5,180\n5,180\n10,90\n")
+    options = {"robot": "arm", "columns": {"t": "t", "q_knee": "q"}, "drop_repeats": True}
+    (r,) = import_recordings("csv", path, options)
+    assert r.t == pytest.approx([0.0, 0.005, 0.01])
+    assert r.channels["q_knee"] == pytest.approx([0.0, np.pi, np.pi / 2])
+    assert "1 row with the time of the row before" in r.meta.notes
+    path.write_bytes(b"SQLite format 3\0" + bytes(100))
+    with pytest.raises(RecordingError, match="is binary, not text: a .db3 bag"):
+        import_recordings("csv", path, options)

@@ -58,7 +58,8 @@ def _named_apart(path: Path, recordings: list[Recording]) -> list[Recording]:
     names = Counter(r.meta.episode for r in recordings)
     result = []
     for r in recordings:
-        name, folders = r.meta.episode, ()
+        name = r.meta.episode
+        folders: tuple[str, ...] = ()
         if names[name] > 1 and r.origin is not None and path.is_dir():
             folders = r.origin.parent.relative_to(path).parts
         note = f"Called {name} in the source, as others are." if folders else ""

@@ -55,7 +55,7 @@ class State:
 
 @dataclass(frozen=True)
 class Kind:
-    """A type of message: its names, its fields, and what it says of joints: ``State``'s stamp_ns, source, names, fields."""
+    """A type of message: its names, its fields, and the stamp, source, names and values that it says of joints."""
 
     types: tuple[str, ...]
     model: type[Decoded]
@@ -148,7 +148,7 @@ def _until_the_cut(records: Iterator[Any]) -> Iterator[tuple[Any, Any, Any]]:
     while True:
         try:
             record = next(records)
-        except Exception:  # noqa: BLE001  (the end, or whatever a reader or decompressor meets in a damaged file)
+        except Exception:  # (the end, or whatever a reader or decompressor meets in a damaged file)
             return
         if isinstance(record, Schema):
             schemas[record.id] = record
@@ -282,7 +282,7 @@ def channels(
         topic: one_source(path, topic, of, joints, notes, measured=topic == state_topic) for topic, of in states.items()
     }
     blocks = {topic: _blocks(topic, of, joints, notes) for topic, of in chosen.items()}
-    chosen = {topic: of for topic, (of, _) in blocks.items()}
+    chosen = {topic: list(of) for topic, (of, _) in blocks.items()}
     # Header stamps are when the state was measured, log times when it was written. One kind for all messages.
     stamped = all(s.stamp_ns > 0 for of in chosen.values() for s in of)
     clock = {k: np.array([s.stamp_ns if stamped else s.log_ns for s in of], np.int64) for k, of in chosen.items()}

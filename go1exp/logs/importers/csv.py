@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,18 +12,16 @@ import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
+import go1exp.logs.importers.clock as clocks
 from go1exp.base.wording import counted
 from go1exp.config.schema.joint_values import JointValues, each_within, spread
 from go1exp.config.schema.registry import STRICT, ConfigError, Positive, as_json, explain, importer, nearest
-from go1exp.logs.importers.source import LEVEL, files, recording, restarts, without_repeats
-from go1exp.logs.importers.table import UTF8, Layout, names, read
+from go1exp.logs.importers.source import LEVEL, files, recording, without_repeats
+from go1exp.logs.importers.table import UTF8, Layout, Table, names, read
 from go1exp.logs.recording import FLAG, FOOT_FORCE, JOINT_QUANTITIES, VECTORS, Quaternion, Recording, RecordingError
 
 PATH = "importer.csv"
 """Where a complaint about an option begins."""
-
-COARSE = 0.1
-"""Share of rows with the time of the row before, from which the clock is rounded; fewer are copies of a row."""
 
 _TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _ANGLE = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "turn": 2 * np.pi}
@@ -53,9 +51,6 @@ UNITS: dict[str, dict[str, float]] = {
 SPELLINGS = {"°": "deg", "°/s": "deg/s", "degrees": "deg", "Nm": "N m", "N.m": "N m", "N*m": "N m", "mNm": "mN m"}
 SPELLINGS |= {"m/s^2": "m/s2", "m/s²": "m/s2", "sec": "s", "µs": "us", "μs": "us", "radians": "rad", "rev": "turn"}
 """Other spellings of units in a line of units."""
-
-OVERFLOW = (16, 24, 32)
-"""Bits of counters that begin anew at their end."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -218,9 +213,11 @@ def _recordings(
         # Stamps may be seconds since 1970, of which float64 holds no more than parts of a microsecond.
         cells = table.columns[clock.column]
         channels["t"] = _channel(path, "t", cells - cells[0], clock) - clock.offset
-    overflows = clock is not None and _overflow(cells)
+    overflows = clock is not None and clocks.overflow(cells)
     times = channels["t"] if clock is not None and not overflows else None
-    parts = _episodes(None if episode is None else table.columns[episode], times, len(next(iter(channels.values()))))
+    parts = clocks.episodes(
+        None if episode is None else table.columns[episode], times, len(next(iter(channels.values())))
+    )
     for name, rows in parts:
         remarks = list(general)
         where = f"{path}: episode {name}" if name else str(path)
@@ -230,7 +227,7 @@ def _recordings(
                 if left := len(rows) - len(kept):
                     remarks.append(f"{counted(left, 'row')} with the time of the row before: left out.")
                 rows = kept
-            _check_clock(where, channels["t"][rows], cells[rows], clock.column, lambda k, at=rows: table.place(at[k]))
+            clocks.check(where, channels["t"][rows], cells[rows], clock.column, partial(_place, table, rows))
             remarks.append(f"t = 0 is {cells[rows[0]]} in the column {clock.column!r}.")
             own = {key: values[rows] for key, values in channels.items()}
             own["t"] = own["t"] - own["t"][0]
@@ -245,25 +242,8 @@ def _recordings(
         yield recording(path, "csv", own, notes=" ".join(remarks), **rate, **called, **about)
 
 
-def _episodes(labels: np.ndarray | None, t: np.ndarray | None, rows: int) -> list[tuple[str, np.ndarray]]:
-    """Return name and rows (K,) of each episode: by its label, and by where the clock ``t`` begins anew."""
-    by_label = [("", np.arange(rows))]
-    if labels is not None:
-        values, first, index = np.unique(labels, return_index=True, return_inverse=True)
-        groups = np.split(np.argsort(index, kind="stable"), np.cumsum(np.bincount(index))[:-1])
-        by_label = [(_label(values[k]), groups[k]) for k in np.argsort(first)]
-    found = []
-    for name, part in by_label:
-        begins = [] if t is None else restarts(t[part])
-        pieces = np.split(part, begins)
-        found += [(f"{name}_{k}".strip("_") if begins else name, piece) for k, piece in enumerate(pieces)]
-    return found
-
-
-def _label(value: Any) -> str:
-    """Return the value of an episode's column as a part of a file's name."""
-    whole = not isinstance(value, str) and value == int(value)
-    return re.sub(r"[^\w.-]+", "_", str(int(value) if whole else value)).strip("_") or "_"
+def _place(table: Table, rows: np.ndarray, k: int) -> str:
+    return table.place(int(rows[k]))
 
 
 def _with_units(path: Path, mapping: Mapping[str, Column], units: Mapping[str, str]) -> dict[str, Column]:
@@ -378,44 +358,6 @@ def _without_columns(path: Path, layout: Layout) -> str:
 
 
 # ---------------------------------------------------------------------- the numbers
-
-
-def _check_clock(where: str, t: np.ndarray, cells: np.ndarray, column: str, place: Callable[[int], str]) -> None:
-    """Raise RecordingError if the time ``t`` (T,), s, does not increase; with its place, its cell, and what to do."""
-    if len(t) < 2:
-        raise RecordingError(f"{where}: has {counted(len(t), 'row')} of numbers; at least 2 are needed")
-    steps = np.diff(t)
-    back = np.flatnonzero(steps <= 0)
-    if not back.size:
-        return
-    k = int(back[0])
-    rows = counted(back.size, "such row")
-    where = f"{where}: column {column!r} (for t): must increase strictly, but {place(k + 1)} has {cells[k + 1]} after"
-    where += f" {cells[k]} ({rows})"
-    if bits := _overflow(cells):
-        raise RecordingError(f"{where}; it is a counter of {bits} bits that overflows: add {2**bits} from there on")
-    if steps.max() <= 0 and t[-1] < t[0]:
-        raise RecordingError(f"{where}; it runs backward: put the rows in the other order")
-    if steps.min() < 0:
-        several = "sort the rows by time, or leave such rows out; if the file has several episodes, give their column"
-        raise RecordingError(f"{where}; {several} (episode: NAME)")
-    if back.size < COARSE * len(steps) or t[-1] <= t[0]:
-        raise RecordingError(f"{where}; leave such rows out (drop_repeats: true)")
-    hz = (len(t) - 1) / (t[-1] - t[0])
-    raise RecordingError(
-        f"{where}; its times are rounded: take t out of columns and give rate_hz (about {hz:.3g}), "
-        "or keep one row of each time (drop_repeats: true)"
-    )
-
-
-def _overflow(cells: np.ndarray) -> int | None:
-    """Return the bits of a counter (T,) that begins anew at its end; None if it is no such counter."""
-    steps = np.diff(cells.astype(np.float64))
-    ahead = steps[steps > 0]
-    if cells.dtype.kind not in "iu" or not ahead.size:
-        return None
-    usual = 10 * float(np.median(ahead))
-    return next((b for b in OVERFLOW if ((steps[steps < 0] + 2.0**b) > 0).all() and steps.min() + 2.0**b < usual), None)
 
 
 def _channel(path: Path, name: str, values: np.ndarray, column: Column) -> np.ndarray:

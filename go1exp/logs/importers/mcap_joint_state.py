@@ -8,8 +8,8 @@ from typing import Any, Literal
 
 from pydantic import AliasChoices, Field
 
+import go1exp.logs.importers.bags as bags
 from go1exp.config.schema.registry import NonNegative, Positive, importer
-from go1exp.logs.importers import bags
 from go1exp.logs.importers.source import files, recording
 from go1exp.logs.recording import Quaternion, Recording
 
@@ -27,9 +27,9 @@ class _Header(bags.Decoded):
 class _JointState(bags.Decoded):
     header: _Header | None = None
     name: tuple[str, ...]
-    position: list[float] = []
-    velocity: list[float] = []
-    effort: list[float] = []
+    position: tuple[float, ...] = ()
+    velocity: tuple[float, ...] = ()
+    effort: tuple[float, ...] = ()
 
 
 def _joints(state: _JointState) -> tuple[int, tuple[Any, ...], tuple[str, ...], Mapping[str, Sequence[float]]]:

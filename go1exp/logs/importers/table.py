@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 
+import go1exp.logs.importers.parquet as parquet
 from go1exp.base.wording import counted
 from go1exp.logs.importers.source import beginning, kind
-from go1exp.logs.recording import KEY, RecordingError
+from go1exp.logs.recording import RecordingError
 
 UTF8 = "utf-8"
 
@@ -93,7 +94,7 @@ class _NoNumber(ValueError):
 
 def names(path: Path, layout: Layout) -> list[str]:
     """Return the names of the columns: those of the first line, or 1, 2, 3; of a list, ``name[0]``, ``name[1]``."""
-    return list(_parquet_names(path)) if _is_parquet(path) else list(_text_names(path, layout))
+    return list(parquet.column_names(path)) if parquet.is_parquet(path) else list(_text_names(path, layout))
 
 
 def read(path: Path, wanted: Mapping[str, str], layout: Layout, labels: str | None = None) -> Table:
@@ -109,8 +110,8 @@ def read(path: Path, wanted: Mapping[str, str], layout: Layout, labels: str | No
         RecordingError: if it is no table, lacks a column, or holds what is no number; with every such column.
     """
     units: dict[str, str] = {}
-    if _is_parquet(path):
-        present = list(_parquet_names(path))
+    if parquet.is_parquet(path):
+        present = list(parquet.column_names(path))
     else:
         given = _text_names(path, layout)
         units = _units(path, layout, given)
@@ -123,9 +124,13 @@ def read(path: Path, wanted: Mapping[str, str], layout: Layout, labels: str | No
     there = [name for name in wanted if name in present]
 
     def place(row: int) -> str:
-        return f"row {row}" if _is_parquet(path) else f"line {line_of(path, row, layout)}"
+        return f"row {row}" if parquet.is_parquet(path) else f"line {line_of(path, row, layout)}"
 
-    table = _parquet(path, there) if _is_parquet(path) else _text(path, {n: given[n] for n in there}, layout)
+    table = (
+        parquet.columns_of(path, there)
+        if parquet.is_parquet(path)
+        else _text(path, {n: given[n] for n in there}, layout)
+    )
     values: dict[str, np.ndarray] = {}
     other_sign: list[tuple[str, _NoNumber]] = []
     for name in there:
@@ -243,64 +248,6 @@ def _arrow(path: Path, layout: Layout, wanted: list[str] | None) -> Any:
     except (pa.ArrowException, OSError) as error:
         why = _uneven(path, str(error), layout) or f"not a table of numbers ({str(error).splitlines()[0]})"
         raise RecordingError(f"{path}: {why}") from error
-
-
-# ---------------------------------------------------------------------- Parquet
-
-
-def _is_parquet(path: Path) -> bool:
-    return beginning(path)[:4] == b"PAR1"
-
-
-def _parquet_names(path: Path) -> dict[str, tuple[str, int | None, int]]:
-    """Return the names of the columns -> column in the file, place in its lists (None: no list), length of these.
-
-    The first row has the lengths of lists.
-
-    Raises:
-        RecordingError: if it is damaged, has no rows, or is a recording.
-    """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        with pq.ParquetFile(path) as file:
-            if KEY in (file.metadata.metadata or {}):
-                raise RecordingError(f"{path}: is a recording already; there is nothing to import")
-            first = next(file.iter_batches(batch_size=1), None)
-    except (pa.ArrowException, OSError) as error:
-        raise RecordingError(f"{path}: not a whole Parquet file ({str(error).splitlines()[0]})") from error
-    if first is None or first.num_rows == 0:
-        raise RecordingError(f"{path}: has no rows of numbers")
-    found: dict[str, tuple[str, int | None, int]] = {}
-    for name, (value,) in first.to_pydict().items():
-        if isinstance(value, list):
-            found |= {f"{name}[{k}]": (name, k, len(value)) for k in range(len(value))}
-        else:
-            found[name] = (name, None, 0)
-    return found
-
-
-def _parquet(path: Path, wanted: Iterable[str]) -> dict[str, Any]:
-    """Return columns of a Parquet file as Arrow has them, elements of lists as columns of their own."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    source = {name: place for name, place in _parquet_names(path).items() if name in set(wanted)}
-    try:
-        table = pq.read_table(path, columns=list(dict.fromkeys(name for name, *_ in source.values())))
-    except (pa.ArrowException, OSError) as error:
-        raise RecordingError(f"{path}: not a whole Parquet file ({str(error).splitlines()[0]})") from error
-    columns = {}
-    for ours, (name, k, width) in source.items():
-        column = table.column(name).combine_chunks()
-        if k is not None:
-            lengths = np.asarray(column.value_lengths().fill_null(0)) if hasattr(column, "value_lengths") else width
-            if np.any(lengths != width) or column.null_count:
-                raise RecordingError(f"{path}: column {name!r}: its lists are not all of {width} elements, as row 0's")
-            column = column.flatten()[k::width]
-        columns[ours] = pa.chunked_array([column])
-    return columns
 
 
 # ---------------------------------------------------------------------- complaints

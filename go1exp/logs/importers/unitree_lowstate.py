@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AliasChoices, Field
 
+import go1exp.logs.importers.bags as bags
 from go1exp.config.schema.registry import Positive, importer
-from go1exp.logs.importers import bags
 from go1exp.logs.importers.source import columns, files, recording
 from go1exp.logs.recording import FOOT_FORCE, VECTORS, Quaternion, Recording, RecordingError
 from go1exp.robot import JOINTS, LEGS
