@@ -451,5 +451,5 @@ def test_a_line_of_units_repeats_and_binary_files(tmp_path: Path) -> None:
     assert r.channels["q_knee"] == pytest.approx([0.0, np.pi, np.pi / 2])
     assert "1 row with the time of the row before" in r.meta.notes
     path.write_bytes(b"SQLite format 3\0" + bytes(100))
-    with pytest.raises(RecordingError, match="is binary, not text: a .db3 bag"):
+    with pytest.raises(RecordingError, match=r"is binary, not text: a \.db3 bag"):
         import_recordings("csv", path, options)
