@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -79,7 +79,6 @@ def read(path: Path, topics: Mapping[str, Kind], cut: bool) -> tuple[dict[str, l
     try:
         from mcap.exceptions import UnsupportedCompressionError
         from mcap.reader import make_reader
-        from mcap.stream_reader import StreamReader
         from mcap_ros2.decoder import DecoderFactory
     except ImportError as error:
         raise RecordingError(f"{path}: to read MCAP, {EXTRA} ({error})") from error
@@ -113,30 +112,43 @@ def read(path: Path, topics: Mapping[str, Kind], cut: bool) -> tuple[dict[str, l
     except Exception as error:  # the reader and its decompressors share no base class of errors
         for of in states.values():
             of.clear()
-        found.clear()
-        with path.open("rb") as file:
-            for schema, channel, message in _until_the_cut(StreamReader(file, validate_crcs=True).records):
-                found.add(channel.topic)
-                if channel.topic in topics:
-                    add(schema, channel, message)
+        found = _topics_until_the_cut(path, topics, add)
         for of in states.values():
             of.sort(key=lambda state: state.log_ns)
-        whole = f"{path}: not a whole MCAP file ({error or type(error).__name__})"
-        readable = [f"{len(of)} of {topic}" for topic, of in states.items() if of]
-        if not readable:
-            raise RecordingError(f"{whole}; no message of {' or '.join(topics)} is readable") from error
-        if not cut:
-            last = max(of[-1].log_ns for of in states.values() if of)
-            seconds = (last - min(of[0].log_ns for of in states.values() if of)) / 1e9
-            raise RecordingError(
-                f"{whole}; its first {seconds:.3g} s are readable (messages: {', '.join(readable)}): import them by "
-                f"cut: true, or recover the file: mcap recover {path.name} -o whole.mcap (of the mcap tool)"
-            ) from error
+        if not cut or not any(states.values()):
+            why = f"{path}: not a whole MCAP file ({error or type(error).__name__})"
+            raise RecordingError(f"{why}; {_readable(path, states)}") from error
         notes.append("The log is cut or damaged; this is its readable part.")
     for topic, of in states.items():
         if not of:
             raise RecordingError(f"{path}: no message on topic {topic!r}; it has {', '.join(sorted(found)) or 'none'}")
     return states, notes
+
+
+def _readable(path: Path, states: Mapping[str, Sequence[State]]) -> str:
+    """Return what of a damaged log can be read, and how to get it."""
+    readable = [f"{len(of)} of {topic}" for topic, of in states.items() if of]
+    if not readable:
+        return f"no message of {' or '.join(states)} is readable"
+    last = max(of[-1].log_ns for of in states.values() if of)
+    seconds = (last - min(of[0].log_ns for of in states.values() if of)) / 1e9
+    return (
+        f"its first {seconds:.3g} s are readable (messages: {', '.join(readable)}): import them by "
+        f"cut: true, or recover the file: mcap recover {path.name} -o whole.mcap (of the mcap tool)"
+    )
+
+
+def _topics_until_the_cut(path: Path, topics: Container[str], add: Callable[[Any, Any, Any], None]) -> set[str]:
+    """Return all topics up to where a log cannot be read any further, and ``add`` the messages of ``topics``."""
+    from mcap.stream_reader import StreamReader
+
+    found = set()
+    with path.open("rb") as file:
+        for schema, channel, message in _until_the_cut(StreamReader(file, validate_crcs=True).records):
+            found.add(channel.topic)
+            if channel.topic in topics:
+                add(schema, channel, message)
+    return found
 
 
 def _until_the_cut(records: Iterator[Any]) -> Iterator[tuple[Any, Any, Any]]:
@@ -219,8 +231,8 @@ def one_source(
     for i, state in enumerate(states):
         for key, values in state.fields.items():
             if len(values) not in (0, len(state.names)):
-                names = len(state.names)
-                raise RecordingError(f"{where}: message {i} has {names} names, but {len(values)} of {key}")
+                lengths = f"{len(state.names)} names, but {len(values)} of {key}"
+                raise RecordingError(f"{where}: message {i} has {lengths}")
         filled = tuple(bool(values) for values in state.fields.values())
         zero = measured and not any(state.fields["position"])
         groups.setdefault((state.names, state.source, filled, zero), []).append(state)
@@ -283,23 +295,9 @@ def channels(
     }
     blocks = {topic: _blocks(topic, of, joints, notes) for topic, of in chosen.items()}
     chosen = {topic: list(of) for topic, (of, _) in blocks.items()}
-    # Header stamps are when the state was measured, log times when it was written. One kind for all messages.
-    stamped = all(s.stamp_ns > 0 for of in chosen.values() for s in of)
-    clock = {k: np.array([s.stamp_ns if stamped else s.log_ns for s in of], np.int64) for k, of in chosen.items()}
-    now, rows = clock[state_topic], np.arange(len(clock[state_topic]))
-    notes.insert(0, f"t = 0 is {now[0]} ns of {'the header stamps' if stamped else 'the log'}.")
-    if not stamped and any(s.stamp_ns for of in chosen.values() for s in of):
-        notes.append("Some messages have no header stamp, so t is the time of logging.")
-    fresh = without_repeats(now)
-    if drop_repeats and len(fresh) < len(now):
-        notes.append(f"{counted(len(now) - len(fresh), 'message')} with the time of the one before: left out.")
-        now, rows = now[fresh], rows[fresh]
-    elif len(fresh) < len(now) and (np.diff(now) >= 0).all():
-        twice = counted(len(now) - len(fresh), "message")
-        raise RecordingError(
-            f"{path}: {state_topic}: t: must increase strictly, but row {_first_repeat(now)} has the time of the one "
-            f"before ({twice}); leave such out by drop_repeats: true, unless they are another publisher's"
-        )
+    clock = _clock(chosen, state_topic, notes)
+    rows = _rows(f"{path}: {state_topic}", clock[state_topic], drop_repeats, notes)
+    now = clock[state_topic][rows]
     columns = {"t": (now - now[0]) / 1e9}  # from integers: float64 cannot hold ns since 1970
     for quantity, key in (("q", "position"), ("qd", "velocity"), ("tau_est", "effort")):
         if key in blocks[state_topic][1]:
@@ -322,8 +320,37 @@ def channels(
     return {k: v[use] for k, v in columns.items()}, [s for s, u in zip(kept, use, strict=True) if u]
 
 
-def _first_repeat(now: np.ndarray) -> int:
-    return int(np.flatnonzero(np.diff(now) == 0)[0]) + 1
+def _clock(chosen: Mapping[str, Sequence[State]], state_topic: str, notes: list[str]) -> dict[str, np.ndarray]:
+    """Return the times of each topic's messages, ns since 1970; append to the notes."""
+    # Header stamps are when the state was measured, log times when it was written. One kind for all messages.
+    stamped = all(s.stamp_ns > 0 for of in chosen.values() for s in of)
+    clock = {k: np.array([s.stamp_ns if stamped else s.log_ns for s in of], np.int64) for k, of in chosen.items()}
+    notes.insert(0, f"t = 0 is {clock[state_topic][0]} ns of {'the header stamps' if stamped else 'the log'}.")
+    if not stamped and any(s.stamp_ns for of in chosen.values() for s in of):
+        notes.append("Some messages have no header stamp, so t is the time of logging.")
+    return clock
+
+
+def _rows(where: str, now: np.ndarray, drop_repeats: bool, notes: list[str]) -> np.ndarray:
+    """Return the rows of times ``now`` (T,) to use; append to the notes.
+
+    Raises:
+        RecordingError: if a time repeats, and such rows are not to be left out.
+    """
+    fresh, rows = without_repeats(now), np.arange(len(now))
+    if len(fresh) == len(now):
+        return rows
+    twice = counted(len(now) - len(fresh), "message")
+    if drop_repeats:
+        notes.append(f"{twice} with the time of the one before: left out.")
+        return rows[fresh]
+    if (np.diff(now) >= 0).all():
+        first = int(np.flatnonzero(np.diff(now) == 0)[0]) + 1
+        raise RecordingError(
+            f"{where}: t: must increase strictly, but row {first} has the time of the one before ({twice}); "
+            "leave such out by drop_repeats: true, unless they are another publisher's"
+        )
+    return rows
 
 
 def _blocks(

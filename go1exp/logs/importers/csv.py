@@ -201,13 +201,7 @@ def _recordings(
     table = read(path, labels or wanted, layout, episode if episode not in wanted else None)
     mapping = _with_units(path, mapping, table.units)
     channels = {name: _channel(path, name, table.columns[c.column], c) for name, c in mapping.items()}
-    general = [notes] if notes else []
-    if table.unused:
-        named = ", ".join(name or "one without a name" for name in table.unused)
-        general.append(f"Columns of the source that are left out: {named}.")
-    general += [f"Column {column!r} of the source is {names}." for column, names in wanted.items() if ", " in names]
-    if table.units:
-        general.append(f"Units of the line below the names: {', '.join(filter(None, table.units.values()))}.")
+    general = _remarks(table, wanted, notes)
     clock, cells = mapping.get("t"), np.empty(0)
     if clock is not None:
         # Stamps may be seconds since 1970, of which float64 holds no more than parts of a microsecond.
@@ -240,6 +234,18 @@ def _recordings(
         called = {"episode": f"{path.stem}_{name}"} if name else {}
         rate = {} if rate_hz is None else {"rate_hz": rate_hz}
         yield recording(path, "csv", own, notes=" ".join(remarks), **rate, **called, **about)
+
+
+def _remarks(table: Table, wanted: Mapping[str, str], notes: str) -> list[str]:
+    """Return what the notes of every episode say of the table; ``wanted`` is column -> names of its channels."""
+    remarks = [notes] if notes else []
+    if table.unused:
+        named = ", ".join(name or "one without a name" for name in table.unused)
+        remarks.append(f"Columns of the source that are left out: {named}.")
+    remarks += [f"Column {column!r} of the source is {names}." for column, names in wanted.items() if ", " in names]
+    if table.units:
+        remarks.append(f"Units of the line below the names: {', '.join(filter(None, table.units.values()))}.")
+    return remarks
 
 
 def _place(table: Table, rows: np.ndarray, k: int) -> str:

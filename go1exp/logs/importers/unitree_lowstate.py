@@ -172,40 +172,68 @@ def _one(
             )
     gains: dict[str, tuple[float, ...]] = {}
     if command_topic:
-        commands = [state for state in states[command_topic] if max(map(abs, state.fields["position"])) < STOP]
-        if left := len(states[command_topic]) - len(commands):
-            notes.append(f"{left} commands of {command_topic} have no target of the angle (2.146e9) and are left out.")
-        if not commands:
-            raise RecordingError(f"{path}: {command_topic}: no command has a target of every angle")
-        states[command_topic] = commands
-        for name in ("kp", "kd"):
-            used = {tuple(getattr(m, name) for m in s.message.motor_cmd[: len(JOINTS)]) for s in commands}
-            if len(used) == 1:
-                gains[name] = tuple(float(f"{value:.7g}") for value in used.pop())  # float32 of the message
-            else:
-                notes.append(f"{name} of {command_topic} changes, so that the recording has none.")
+        states[command_topic] = _with_targets(path, command_topic, states[command_topic], notes)
+        gains = _gains(command_topic, states[command_topic], notes)
     channels, kept = bags.channels(path, states, state_topic, command_topic, JOINTS, drop_repeats, notes)
     messages = [state.message for state in kept]
-    for quantity, field in (("imu_quat", "quaternion"), ("imu_gyro", "gyroscope"), ("imu_acc", "accelerometer")):
-        if any(message.imu_state is None for message in messages):
-            continue
-        block = np.array([getattr(message.imu_state, field) for message in messages], np.float64)
-        if block.any():
-            channels |= columns(VECTORS[quantity], block)
-        else:
-            notes.append(f"{field} is zero throughout and is left out.")
-    newton, zero = foot
-    counts = [message.foot_force for message in messages]
-    if newton is not None and all(len(each) == len(LEGS) for each in counts):
-        forces = newton * (np.array(counts) - zero)
-        channels |= columns((FOOT_FORCE + leg for leg in LEGS), forces)
-        notes.append(f"foot_force = {newton:g} N (counts - {list(zero)}).")
-    elif any(any(each) for each in counts):
-        notes.append("foot_force is in counts without a unit and is left out; foot_newton and foot_zero calibrate it.")
+    channels |= _imu_columns(messages, notes) | _foot_columns(messages, *foot, notes)
     notes.append(_ticks(np.array([message.tick for message in messages]), channels["t"]))
     return recording(
         path, f"unitree_lowstate_{about['robot']}", channels, joints=JOINTS, notes=" ".join(notes), **gains, **about
     )
+
+
+def _with_targets(path: Path, topic: str, states: Sequence[bags.State], notes: list[str]) -> list[bags.State]:
+    """Return the commands that have a target of every angle; append to the notes.
+
+    Raises:
+        RecordingError: if there is none.
+    """
+    commands = [state for state in states if max(map(abs, state.fields["position"])) < STOP]
+    if left := len(states) - len(commands):
+        notes.append(f"{left} commands of {topic} have no target of the angle (2.146e9) and are left out.")
+    if not commands:
+        raise RecordingError(f"{path}: {topic}: no command has a target of every angle")
+    return commands
+
+
+def _gains(topic: str, commands: Sequence[bags.State], notes: list[str]) -> dict[str, tuple[float, ...]]:
+    """Return those of ``kp`` and ``kd``, (J,) each, that never change; append to the notes."""
+    gains = {}
+    for name in ("kp", "kd"):
+        used = {tuple(getattr(m, name) for m in s.message.motor_cmd[: len(JOINTS)]) for s in commands}
+        if len(used) == 1:
+            gains[name] = tuple(float(f"{value:.7g}") for value in used.pop())  # float32 of the message
+        else:
+            notes.append(f"{name} of {topic} changes, so that the recording has none.")
+    return gains
+
+
+def _imu_columns(messages: Sequence[_LowState], notes: list[str]) -> dict[str, np.ndarray]:
+    """Return the columns of the IMU (T,) that are not zero throughout; append to the notes."""
+    found: dict[str, np.ndarray] = {}
+    if any(message.imu_state is None for message in messages):
+        return found
+    for quantity, field in (("imu_quat", "quaternion"), ("imu_gyro", "gyroscope"), ("imu_acc", "accelerometer")):
+        block = np.array([getattr(message.imu_state, field) for message in messages], np.float64)
+        if block.any():
+            found |= columns(VECTORS[quantity], block)
+        else:
+            notes.append(f"{field} is zero throughout and is left out.")
+    return found
+
+
+def _foot_columns(
+    messages: Sequence[_LowState], newton: float | None, zero: Sequence[float], notes: list[str]
+) -> dict[str, np.ndarray]:
+    """Return the forces of the feet (T,), N, if a count has a unit; append to the notes."""
+    counts = [message.foot_force for message in messages]
+    if newton is not None and all(len(each) == len(LEGS) for each in counts):
+        notes.append(f"foot_force = {newton:g} N (counts - {list(zero)}).")
+        return columns((FOOT_FORCE + leg for leg in LEGS), newton * (np.array(counts) - zero))
+    if any(any(each) for each in counts):
+        notes.append("foot_force is in counts without a unit and is left out; foot_newton and foot_zero calibrate it.")
+    return {}
 
 
 def _ticks(tick: np.ndarray, t: np.ndarray) -> str:
