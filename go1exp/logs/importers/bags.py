@@ -86,23 +86,23 @@ def read(path: Path, topics: Mapping[str, Kind], cut: bool) -> tuple[dict[str, l
     if not start.startswith(b"\x89MCAP0") and (what := kind(start)):
         raise RecordingError(f"{path}: is {what}")
     states: dict[str, list[State]] = {topic: [] for topic in topics}
-    found: set[str] = set()
+    present: set[str] = set()
     notes: list[str] = []
     factory, decoders = DecoderFactory(), {}
 
     def add(schema: Any, channel: Any, message: Any) -> None:
-        of, where = states[channel.topic], f"{path}: {channel.topic}"
+        known, where = states[channel.topic], f"{path}: {channel.topic}"
         if channel.id not in decoders:
             decoders[channel.id] = _decoder(where, factory, schema, channel.message_encoding, topics[channel.topic])
-        content = _checked(f"{where}: message {len(of)}", topics[channel.topic], decoders[channel.id], message.data)
+        content = _checked(f"{where}: message {len(known)}", topics[channel.topic], decoders[channel.id], message.data)
         stamp, source, names, fields = topics[channel.topic].joints(content)
-        of.append(State(message.log_time, stamp, (channel.id, *source), names, fields, content))
+        known.append(State(message.log_time, stamp, (channel.id, *source), names, fields, content))
 
     try:
         with path.open("rb") as file:
             reader = make_reader(file, validate_crcs=True)
             summary = reader.get_summary()
-            found = {channel.topic for channel in summary.channels.values()} if summary else set()
+            present = {channel.topic for channel in summary.channels.values()} if summary else set()
             for each in reader.iter_messages(topics=list(topics)):
                 add(*each)
     except RecordingError:
@@ -110,28 +110,30 @@ def read(path: Path, topics: Mapping[str, Kind], cut: bool) -> tuple[dict[str, l
     except UnsupportedCompressionError as error:
         raise RecordingError(f"{path}: its chunks are compressed; to read them, pip install {error}") from error
     except Exception as error:  # the reader and its decompressors share no base class of errors
-        for of in states.values():
-            of.clear()
-        found = _topics_until_the_cut(path, topics, add)
-        for of in states.values():
-            of.sort(key=lambda state: state.log_ns)
+        for messages in states.values():
+            messages.clear()
+        present = _topics_until_the_cut(path, topics, add)
+        for messages in states.values():
+            messages.sort(key=lambda state: state.log_ns)
         if not cut or not any(states.values()):
             why = f"{path}: not a whole MCAP file ({error or type(error).__name__})"
             raise RecordingError(f"{why}; {_readable(path, states)}") from error
         notes.append("The log is cut or damaged; this is its readable part.")
-    for topic, of in states.items():
-        if not of:
-            raise RecordingError(f"{path}: no message on topic {topic!r}; it has {', '.join(sorted(found)) or 'none'}")
+    for topic, messages in states.items():
+        if not messages:
+            raise RecordingError(
+                f"{path}: no message on topic {topic!r}; it has {', '.join(sorted(present)) or 'none'}"
+            )
     return states, notes
 
 
 def _readable(path: Path, states: Mapping[str, Sequence[State]]) -> str:
     """Return what of a damaged log can be read, and how to get it."""
-    readable = [f"{len(of)} of {topic}" for topic, of in states.items() if of]
+    readable = [f"{len(m)} of {topic}" for topic, m in states.items() if m]
     if not readable:
         return f"no message of {' or '.join(states)} is readable"
-    last = max(of[-1].log_ns for of in states.values() if of)
-    seconds = (last - min(of[0].log_ns for of in states.values() if of)) / 1e9
+    last = max(m[-1].log_ns for m in states.values() if m)
+    seconds = (last - min(m[0].log_ns for m in states.values() if m)) / 1e9
     return (
         f"its first {seconds:.3g} s are readable (messages: {', '.join(readable)}): import them by "
         f"cut: true, or recover the file: mcap recover {path.name} -o whole.mcap (of the mcap tool)"
@@ -142,13 +144,13 @@ def _topics_until_the_cut(path: Path, topics: Container[str], add: Callable[[Any
     """Return all topics up to where a log cannot be read any further, and ``add`` the messages of ``topics``."""
     from mcap.stream_reader import StreamReader
 
-    found = set()
+    present = set()
     with path.open("rb") as file:
         for schema, channel, message in _until_the_cut(StreamReader(file, validate_crcs=True).records):
-            found.add(channel.topic)
+            present.add(channel.topic)
             if channel.topic in topics:
                 add(schema, channel, message)
-    return found
+    return present
 
 
 def _until_the_cut(records: Iterator[Any]) -> Iterator[tuple[Any, Any, Any]]:
@@ -229,14 +231,14 @@ def one_source(
     """
     where, groups = f"{path}: {topic}", dict[tuple[Any, ...], list[State]]()
     for i, state in enumerate(states):
-        for key, values in state.fields.items():
+        for field, values in state.fields.items():
             if len(values) not in (0, len(state.names)):
-                lengths = f"{len(state.names)} names, but {len(values)} of {key}"
+                lengths = f"{len(state.names)} names, but {len(values)} of {field}"
                 raise RecordingError(f"{where}: message {i} has {lengths}")
         filled = tuple(bool(values) for values in state.fields.values())
         zero = measured and not any(state.fields["position"])
         groups.setdefault((state.names, state.source, filled, zero), []).append(state)
-    able = {key: of for key, of in groups.items() if set(joints) <= set(key[0]) and (key[2][0] or not measured)}
+    able = {key: group for key, group in groups.items() if set(joints) <= set(key[0]) and (key[2][0] or not measured)}
     if not able and any(set(joints) <= set(key[0]) for key in groups):
         raise RecordingError(f"{where}: its messages hold no position")
     if not able:
@@ -249,15 +251,15 @@ def one_source(
     main = max(able, key=lambda key: _rank(able[key]))
     clock = np.array([s.log_ns for s in able[main]], np.int64)
     taken, left = list(able[main]), Counter[str]()
-    for key, of in groups.items():
+    for key, group in groups.items():
         if key == main:
             continue
-        if key in able and not _between(clock, np.array([s.log_ns for s in of], np.int64)):
-            taken += of
+        if key in able and not _between(clock, np.array([s.log_ns for s in group], np.int64)):
+            taken += group
         else:
             what = "all of them zero, " if key in able and key[3] else ""
             source = "a second source of these joints" if key in able else "another source"
-            left[f"{source} ({what}{', '.join(key[0])})"] += len(of)
+            left[f"{source} ({what}{', '.join(key[0])})"] += len(group)
     notes += [f"{topic}: {counted(n, 'message')} of {source} left out." for source, n in left.items()]
     order = {id(state): i for i, state in enumerate(states)}
     return sorted(taken, key=lambda state: order[id(state)])
@@ -291,10 +293,11 @@ def channels(
     Commands are held from one to the next; rows before the first one are left out.
     """
     chosen = {
-        topic: one_source(path, topic, of, joints, notes, measured=topic == state_topic) for topic, of in states.items()
+        topic: one_source(path, topic, group, joints, notes, measured=topic == state_topic)
+        for topic, group in states.items()
     }
-    blocks = {topic: _blocks(topic, of, joints, notes) for topic, of in chosen.items()}
-    chosen = {topic: list(of) for topic, (of, _) in blocks.items()}
+    blocks = {topic: _blocks(topic, group, joints, notes) for topic, group in chosen.items()}
+    chosen = {topic: list(whole) for topic, (whole, _) in blocks.items()}
     clock = _clock(chosen, state_topic, notes)
     rows = _rows(f"{path}: {state_topic}", clock[state_topic], drop_repeats, notes)
     now = clock[state_topic][rows]
@@ -323,10 +326,10 @@ def channels(
 def _clock(chosen: Mapping[str, Sequence[State]], state_topic: str, notes: list[str]) -> dict[str, np.ndarray]:
     """Return the times of each topic's messages, ns since 1970; append to the notes."""
     # Header stamps are when the state was measured, log times when it was written. One kind for all messages.
-    stamped = all(s.stamp_ns > 0 for of in chosen.values() for s in of)
-    clock = {k: np.array([s.stamp_ns if stamped else s.log_ns for s in of], np.int64) for k, of in chosen.items()}
+    stamped = all(s.stamp_ns > 0 for group in chosen.values() for s in group)
+    clock = {k: np.array([s.stamp_ns if stamped else s.log_ns for s in group], np.int64) for k, group in chosen.items()}
     notes.insert(0, f"t = 0 is {clock[state_topic][0]} ns of {'the header stamps' if stamped else 'the log'}.")
-    if not stamped and any(s.stamp_ns for of in chosen.values() for s in of):
+    if not stamped and any(s.stamp_ns for group in chosen.values() for s in group):
         notes.append("Some messages have no header stamp, so t is the time of logging.")
     return clock
 

@@ -26,12 +26,12 @@ def episodes(labels: np.ndarray | None, t: np.ndarray | None, rows: int) -> list
         values, first, index = np.unique(labels, return_index=True, return_inverse=True)
         groups = np.split(np.argsort(index, kind="stable"), np.cumsum(np.bincount(index))[:-1])
         by_label = [(_label(values[k]), groups[k]) for k in np.argsort(first)]
-    found = []
+    named = []
     for name, part in by_label:
         begins = [] if t is None else restarts(t[part])
         pieces = np.split(part, begins)
-        found += [(f"{name}_{k}".strip("_") if begins else name, piece) for k, piece in enumerate(pieces)]
-    return found
+        named += [(f"{name}_{k}".strip("_") if begins else name, piece) for k, piece in enumerate(pieces)]
+    return named
 
 
 def _label(value: Any) -> str:

@@ -223,17 +223,17 @@ def _recordings(
                 rows = kept
             clocks.check(where, channels["t"][rows], cells[rows], clock.column, partial(_place, table, rows))
             remarks.append(f"t = 0 is {cells[rows[0]]} in the column {clock.column!r}.")
-            own = {key: values[rows] for key, values in channels.items()}
-            own["t"] = own["t"] - own["t"][0]
+            series = {key: values[rows] for key, values in channels.items()}
+            series["t"] = series["t"] - series["t"][0]
         else:
             assert rate_hz is not None  # checked with the mapping
-            own = {"t": np.arange(len(rows)) / rate_hz} | {key: values[rows] for key, values in channels.items()}
+            series = {"t": np.arange(len(rows)) / rate_hz} | {key: values[rows] for key, values in channels.items()}
             remarks.append(f"No clock in the source: t = row / {rate_hz:g} Hz.")
         if len(parts) > 1 and episode is None:
             remarks.append(f"The clock begins anew {counted(len(parts) - 1, 'time')} in the file: one recording each.")
         called = {"episode": f"{path.stem}_{name}"} if name else {}
         rate = {} if rate_hz is None else {"rate_hz": rate_hz}
-        yield recording(path, "csv", own, notes=" ".join(remarks), **rate, **called, **about)
+        yield recording(path, "csv", series, notes=" ".join(remarks), **rate, **called, **about)
 
 
 def _remarks(table: Table, wanted: Mapping[str, str], notes: str) -> list[str]:

@@ -37,13 +37,13 @@ def column_names(path: Path) -> dict[str, tuple[str, int | None, int]]:
         raise RecordingError(f"{path}: not a whole Parquet file ({str(error).splitlines()[0]})") from error
     if first is None or first.num_rows == 0:
         raise RecordingError(f"{path}: has no rows of numbers")
-    found: dict[str, tuple[str, int | None, int]] = {}
+    places: dict[str, tuple[str, int | None, int]] = {}
     for name, (value,) in first.to_pydict().items():
         if isinstance(value, list):
-            found |= {f"{name}[{k}]": (name, k, len(value)) for k in range(len(value))}
+            places |= {f"{name}[{k}]": (name, k, len(value)) for k in range(len(value))}
         else:
-            found[name] = (name, None, 0)
-    return found
+            places[name] = (name, None, 0)
+    return places
 
 
 def columns_of(path: Path, wanted: Iterable[str]) -> dict[str, Any]:

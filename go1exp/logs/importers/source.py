@@ -92,14 +92,14 @@ def restarts(t: np.ndarray) -> list[int]:
     """
     steps = np.diff(t)
     ordinary = MOST_STEPS * np.median(steps[steps > 0]) if (steps > 0).any() else 0.0
-    found, begin = [], 0
+    begins, begin = [], 0
     for k in np.flatnonzero(steps < 0).tolist():
         lost, passed = -steps[k], t[k] - t[begin]
         if k + 1 >= len(steps) or passed <= 0 or lost < RESTART * passed or not 0 <= steps[k + 1] <= ordinary:
             return []
         begin = k + 1
-        found.append(begin)
-    return found
+        begins.append(begin)
+    return begins
 
 
 def without_repeats(t: np.ndarray) -> np.ndarray:

@@ -121,19 +121,19 @@ def read(path: Path, wanted: Mapping[str, str], layout: Layout, labels: str | No
     hint = _question(present[0], layout) if len(present) == 1 else _no_names(present, layout)
     # Where the delimiter is another one, or names are missing, no name is right, and one complaint will do.
     wrong = [_missing(path, name, wanted[name], present) + hint for name in (lacking[:1] if hint else lacking)]
-    there = [name for name in wanted if name in present]
+    existing = [name for name in wanted if name in present]
 
     def place(row: int) -> str:
         return f"row {row}" if parquet.is_parquet(path) else f"line {line_of(path, row, layout)}"
 
     table = (
-        parquet.columns_of(path, there)
+        parquet.columns_of(path, existing)
         if parquet.is_parquet(path)
-        else _text(path, {n: given[n] for n in there}, layout)
+        else _text(path, {n: given[n] for n in existing}, layout)
     )
     values: dict[str, np.ndarray] = {}
     other_sign: list[tuple[str, _NoNumber]] = []
-    for name in there:
+    for name in existing:
         try:
             values[name] = _words(table[name]) if name == labels else _numbers(table[name], place, layout)
         except _NoNumber as error:

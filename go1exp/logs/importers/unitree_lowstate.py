@@ -164,8 +164,8 @@ def _one(
     """Return one log as a recording."""
     topics = {state_topic: STATE} | ({command_topic: COMMAND} if command_topic else {})
     states, notes = bags.read(path, topics, cut)
-    for topic, of in states.items():
-        motors = min(len(state.names) for state in of)
+    for topic, group in states.items():
+        motors = min(len(state.names) for state in group)
         if motors < len(JOINTS):
             raise RecordingError(
                 f"{path}: {topic}: a message has {motors} motors; a {about['robot']} has {len(JOINTS)}"
@@ -211,16 +211,16 @@ def _gains(topic: str, commands: Sequence[bags.State], notes: list[str]) -> dict
 
 def _imu_columns(messages: Sequence[_LowState], notes: list[str]) -> dict[str, np.ndarray]:
     """Return the columns of the IMU (T,) that are not zero throughout; append to the notes."""
-    found: dict[str, np.ndarray] = {}
+    channels: dict[str, np.ndarray] = {}
     if any(message.imu_state is None for message in messages):
-        return found
+        return channels
     for quantity, field in (("imu_quat", "quaternion"), ("imu_gyro", "gyroscope"), ("imu_acc", "accelerometer")):
         block = np.array([getattr(message.imu_state, field) for message in messages], np.float64)
         if block.any():
-            found |= columns(VECTORS[quantity], block)
+            channels |= columns(VECTORS[quantity], block)
         else:
             notes.append(f"{field} is zero throughout and is left out.")
-    return found
+    return channels
 
 
 def _foot_columns(
