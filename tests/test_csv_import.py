@@ -278,6 +278,10 @@ def clocked(path: Path, stamps: np.ndarray) -> Path:
         (4 * K[::-1], "line 3 has 152 after 156 (39 such rows); it runs backward: put the rows in the other order"),
         (np.where(K == 20, 100, 10 * K), "line 22 has 100 after 190 (1 such row); sort the rows by time, or leave"),
         (np.where(K == 20, 190, 10 * K), "line 22 has 190 after 190 (1 such row); leave such rows out"),
+        (
+            1000 * np.arange(100) % 2**16,
+            "line 68 has 464 after 65000 (1 such row); it is a counter of 16 bits that overflows: add 65536",
+        ),
         (K[:1], "has 1 row of numbers; at least 2 are needed"),
     ],
 )

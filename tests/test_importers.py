@@ -431,13 +431,13 @@ def message(i: int, names: list[str], stamp: int | None = None, **fields: Any) -
 Sent = list[tuple[int, str, dict[str, Any]]]
 
 
-def write_cdr(path: Path, sent: Sent, kind: str = "sensor_msgs/msg/JointState") -> Path:
+def write_cdr(path: Path, sent: Sent, kind: str = "sensor_msgs/msg/JointState", definition: str = MSGDEF) -> Path:
     """Write (row, topic, message); rows are logged a millisecond late."""
     from mcap_ros2.writer import Writer
 
     with path.open("wb") as file:
         writer = Writer(file)
-        schema = writer.register_msgdef(kind, MSGDEF)
+        schema = writer.register_msgdef(kind, definition)
         for i, topic, content in sent:
             log = START + 2_000_000 * i + 1_000_000
             writer.write_message(topic=topic, schema=schema, message=content, log_time=log, publish_time=log)
@@ -499,7 +499,7 @@ def test_mcap_commands_hold_until_the_next(tmp_path: Path) -> None:
     assert r.channels["tau_est_a"].tolist() == [0.5] * 8
     assert r.channels["q_a"] == pytest.approx(0.1 * np.arange(2, 10))
     assert r.t[0] == pytest.approx(0.004)
-    assert "2 states before the first command" in r.meta.notes
+    assert "The 2 states before" in r.meta.notes
 
 
 def test_mcap_of_a_go1_comes_in_our_order_unless_told_otherwise(tmp_path: Path) -> None:
@@ -586,3 +586,69 @@ def test_without_the_extra_the_message_names_it(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setitem(sys.modules, "mcap_ros2.decoder", None)
     with pytest.raises(RecordingError, match=r'pip install "go1exp\[logs\]"'):
         import_recordings("mcap_joint_state", path, {})
+
+
+LOW_STATE = """unitree_go/IMUState imu_state
+unitree_go/MotorState[20] motor_state
+int16[4] foot_force
+uint32 tick
+================================================================================
+MSG: unitree_go/IMUState
+float32[4] quaternion
+float32[3] gyroscope
+float32[3] accelerometer
+================================================================================
+MSG: unitree_go/MotorState
+float32 q
+float32 dq
+float32 tau_est
+"""
+
+
+def low_state(i: int, motors: int = 20) -> dict[str, Any]:
+    """Return one LowState every 2 ms, whose tick counts milliseconds."""
+    imu = {"quaternion": [1.0, 0.0, 0.0, 0.0], "gyroscope": [0.0] * 3, "accelerometer": [0.5, 0.25, 9.75]}
+    state = [{"q": k + i / 64, "dq": -k / 4, "tau_est": k / 8} for k in range(motors)]
+    return {"imu_state": imu, "motor_state": state, "foot_force": [20, 30, 40, 50 + i], "tick": 2 * i}
+
+
+def test_low_states_of_a_go2_come_in_the_order_of_the_motors(tmp_path: Path) -> None:
+    sent = [(i, "/lowstate", low_state(i)) for i in range(10)]
+    path = write_cdr(tmp_path / "log.mcap", sent, "unitree_go/msg/LowState", LOW_STATE)
+    (r,) = import_recordings("unitree_lowstate_go2", path, {})
+    assert (r.meta.robot, r.meta.joints, r.meta.base) == ("go2", JOINTS, "floating")
+    assert np.array_equal(r.t, np.arange(10) * 2_000_000 / 1e9)
+    assert np.array_equal(r.joint("q"), np.arange(12) + np.arange(10)[:, None] / 64)
+    assert np.array_equal(r.joint("qd")[3], -np.arange(12) / 4)
+    assert np.array_equal(r.joint("tau_est")[3], np.arange(12) / 8)
+    assert [r.channels[name][0] for name in recording.VECTORS["imu_acc"]] == [0.5, 0.25, 9.75]
+    assert not r.has("imu_gyro")
+    assert not r.has("foot_force")
+    for note in ("gyroscope is zero throughout", "foot_force is in counts without a unit", "tick counts 1000 a second"):
+        assert note in r.meta.notes
+    (r,) = import_recordings("unitree_lowstate_go2", path, {"foot_newton": 0.5, "foot_zero": [20, 20, 20, 20]})
+    assert [r.channels[f"foot_force_{leg}"][2] for leg in ("FR", "FL", "RR", "RL")] == [0.0, 5.0, 10.0, 16.0]
+
+
+def test_low_commands_of_a_go1_give_targets_and_gains(tmp_path: Path) -> None:
+    sent: Sent = [(i, "/low_state", low_state(i)) for i in range(10)]
+    for i, q, kd in ((0, 2.146e9, 0.5), (2, 0.75, 0.5), (5, 1.25, 1.0)):
+        sent.append((i, "/low_cmd", {"motorCmd": [{"q": q, "Kp": 20.0, "Kd": kd}] * 20}))
+    path = write_json(tmp_path / "log.mcap", sent)
+    (r,) = import_recordings("unitree_lowstate_go1", path, {"command_topic": "/low_cmd"})
+    assert r.meta.robot == "go1"
+    assert (r.meta.kp, r.meta.kd) == ((20.0,) * 12, None)
+    assert r.channels["q_target_RL_calf"].tolist() == [0.75] * 3 + [1.25] * 5
+    assert np.array_equal(r.channels["q_RL_calf"], 11 + np.arange(2, 10) / 64)
+    for note in (
+        "of /low_cmd have no target",
+        "kd of /low_cmd changes",
+        "The 2 states before",
+    ):
+        assert note in r.meta.notes
+
+
+def test_low_states_of_too_few_motors_are_refused(tmp_path: Path) -> None:
+    path = write_json(tmp_path / "log.mcap", [(i, "/low_state", low_state(i, motors=8)) for i in range(3)])
+    with pytest.raises(RecordingError, match="/low_state: a message has 8 motors; a go1 has 12"):
+        import_recordings("unitree_lowstate_go1", path, {})
