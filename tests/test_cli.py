@@ -384,6 +384,7 @@ def test_the_value_of_an_option_is_no_setting(tmp_path: Path) -> None:
         "path": "logs",
         "columns": None,
         "options": {"rate_hz": 100.0},
+        "drop": None,
         "out": "recordings",
         "plugins": [],
     }
@@ -591,7 +592,7 @@ def test_a_place_for_results_that_cannot_be_written_to_is_refused_before_the_wor
     done = refuse(tmp_path, words[0], subject, *words[1:])
     assert done.returncode == 2, done.stderr
     assert done.stdout == ""
-    assert done.stderr.startswith(f"go1exp {words[0]}: {key} cannot be written to (")
+    assert done.stderr.splitlines()[-1].startswith(f"go1exp {words[0]}: {key} cannot be written to (")
 
 
 def test_a_checkpoint_is_named_as_a_file_in_the_run_folder(run: Path, tmp_path: Path) -> None:

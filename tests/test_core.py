@@ -810,9 +810,11 @@ def test_a_reset_heals_an_environment_after_a_fault(make_core: Make, elsewhere: 
     core.reset()
     if what == "action":
         action[1, 5] = torch.nan
+        with pytest.raises(NumericalFault):
+            core.step(action)
     else:
         getattr(core.backend, what)[1, 8] = torch.nan
-    core.step(action)
+        core.step(action)
     assert torch.isfinite(core.reset()).all()
     result = core.step(torch.zeros(3, 12))
     core.check(result)

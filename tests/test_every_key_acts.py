@@ -238,6 +238,7 @@ OTHER: dict[str, Callable[[Walk], list[Any]]] = {
     "record_audit:files": lambda walk: [[str(walk.recorded("lossy", {"sensors.dropped": 0.3}))]],
     "record_import:source": lambda walk: ["so101_arm"],
     "record_import:path": lambda walk: [str(walk.logs(1))],
+    "record_import:drop": lambda walk: ["impossible"],
     "record_import:options": lambda walk: [{"rate_hz": 100.0}],
     "record_import:columns": lambda walk: [{"q_hip": "jpos1"}],
     "fit-actuator:recordings": lambda walk: [str(walk.recorded("noisy", {**FIVE, "sensors.qd.noise": 0.3}))],
@@ -640,6 +641,12 @@ class Walk:
         if leaf.program == "record_import" and leaf.key == "columns":
             table = ["source=csv", f"path={self.logs(0)}", "options={robot: go2, rate_hz: 100.0}"]
             return [*table, "columns={q_hip: jpos0}"]
+        if leaf.program == "record_import" and leaf.key == "drop":
+            table = self._scratch / "spiked.csv"
+            moved = np.column_stack([np.arange(200) / 100.0, np.sin(np.arange(200) / 20.0)])
+            moved[100, 1] += 1.0
+            np.savetxt(table, moved, delimiter=",", header="t,q", comments="")
+            return ["source=csv", f"path={table}", "options={robot: arm}", "columns={t: t, q_elbow: q}"]
         if leaf.program == "record_import":
             return ["source=go2_in_air", f"path={self.logs(0)}"]
         if leaf.program == "fit-actuator" and leaf.key == "gains":

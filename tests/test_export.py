@@ -365,7 +365,7 @@ def test_another_form_of_the_same_archive_is_refused(data: bytes) -> None:
     ("change", "message"),
     [
         (lambda m: b"{", "invalid JSON"),
-        (lambda m: as_json([]), "must have format and sha256"),
+        (lambda m: as_json([]), "must be a mapping"),
         (lambda m: as_json({**m, "note": "x"}), "must have format and sha256"),
         (lambda m: as_json({**m, "format": 2}), "format 2, this version reads 1"),
         (lambda m: as_json({**m, "sha256": {}}), "must give the SHA-256 of metadata.json"),

@@ -36,7 +36,7 @@ from tests.test_every_key_acts import unread
 SMALL = {
     "sinusoid": ("robots=2", "duration_s=0.8", "ladder=[{amplitude:[0.5,0.3,0.5],period:0.4}]", "claims={}"),
     "kicks": ("robots=2", "impulses=[3.0]", "first_s=2.0", "every_s=2.0", "jitter_s=0.1"),
-    "gait": ("robots=2", "duration_s=0.6", "settle_s=0.2", "commands=[[0.5,0.0,0.0],[1.0,0.0,0.0]]"),
+    "gait": ("robots=3", "duration_s=0.6", "settle_s=0.2", "commands=[[0.5,0.0,0.0],[1.0,0.0,0.0]]"),
     "corners": ("robots=2", "duration_s=0.6", "settle_s=0.4", "rest_s=0.2", "commands=[[0.5,0.0,0.0]]"),
     "energy": ("robots=2", "duration_s=0.6", "settle_s=0.2", "commands=[[0.5,0.0,0.0]]"),
     "hardware": ("robots=2", "duration_s=0.4", "settle_s=0.2", "commands=[[0.5,0.0,0.0]]", "delays_ms=[20.0]"),
@@ -196,9 +196,9 @@ def test_a_better_subject_is_called_better_and_a_worse_one_worse(
     other = dataclasses.replace(one, label="other", played=dataclasses.replace(one.played, rows=rows[:-1]))
     found = {(d.quantity, tuple(d.condition.values())): d for d in comparing.compared(one, other)}
     d = found["rmse_x", (0.5, 0.0, 0.0)]
-    assert (d.word, d.difference.n) == ("better", 2)
+    assert (d.word, d.difference.n) == ("better", 3)
     assert d.difference.estimate == pytest.approx(-0.1, abs=1e-3)
-    assert found["rmse_x", (1.0, 0.0, 0.0)].difference.n == 1
+    assert found["rmse_x", (1.0, 0.0, 0.0)].difference.n == 2
     assert found["rmse_x", (1.0, 0.0, 0.0)].word == "no significant difference"
 
 
