@@ -1,4 +1,4 @@
-"""``go1exp export`` and ``go1exp export check``."""
+"""``go1exp export``, ``go1exp export check`` and ``go1exp export import``."""
 
 from __future__ import annotations
 
@@ -166,3 +166,37 @@ def estimator(settings: dict[str, Any]) -> str:
 
 
 CHECK = App("export_check", _check, ExportCheckSettings, title="export check")
+
+
+@schema.settings
+class ExportImportSettings:
+    """``conf/export_import.yaml``.
+
+    Attributes:
+        network: ONNX or TorchScript file of another framework's policy.
+        spec: isaaclab, mjlab, legged_gym, unitree_rl, or a YAML file with the policy's contract.
+        out: the bundle; null writes NETWORK.zip here.
+        force: write it even where the policy falls, or another contract is likelier.
+    """
+
+    network: Annotated[str, Field(min_length=1)]
+    spec: Annotated[str, Field(min_length=1)]
+    out: str | None
+    force: bool
+
+
+def _import(container: dict[str, Any]) -> None:
+    settings = parse(ExportImportSettings, container)
+    file = Path(settings.network)
+    out = Path(settings.out or f"{file.stem}.zip")
+    writable(str(out.parent))
+
+    from go1exp.deploy.export.contract import build_foreign
+
+    data, lines = build_foreign(file, settings.spec, force=settings.force)
+    write_bytes(out, data)
+    for line in (*lines, f"written to {out}", f"now: {command('export', 'check', str(out))}"):
+        print(line)
+
+
+IMPORT = App("export_import", _import, ExportImportSettings, title="export import")

@@ -16,7 +16,7 @@ VERBS = {
     "play": "watch a trained policy: a clip without a display, a live viewer with one",
     "record": "drive the simulated robot and log it; audit recordings, import others",
     "gap": "find where simulation and recordings disagree, name the missing effect, add it",
-    "export": "pack a trained policy into one sealed file for the robot; check such a file",
+    "export": "pack a trained policy into one sealed file for the robot; check such a file; import others",
     "deploy": "run a bundle's policy in real time on a robot, or on a simulated one in another process",
     "sim": "the simulated robot alone, for any client that speaks the Go1's protocol",
     "fit-actuator": "learn an actuator net from recordings",
@@ -33,11 +33,12 @@ MODULES = {
     "record_audit": "record",
     "record_import": "record",
     "export_check": "export",
+    "export_import": "export",
     "gap_loop": "gap_next",
 }
 """Modules that do not have their verb's name."""
 
-SUBVERBS = {"record": ("audit", "import"), "export": ("check",), "gap": ("next", "loop")}
+SUBVERBS = {"record": ("audit", "import"), "export": ("check", "import"), "gap": ("next", "loop")}
 """Second words of a verb that are verbs of their own; the configuration is called VERB_WORD."""
 
 EVERY = (*VERBS, *(f"{verb}_{word}" for verb, words in SUBVERBS.items() for word in words))
@@ -47,6 +48,7 @@ POSITIONAL: dict[str, tuple[str, ...]] = {
     "record_audit": ("files",),
     "record_import": ("source", "path"),
     "export_check": ("file",),
+    "export_import": ("network",),
     "gap": ("stage",),
     "deploy": ("bundle",),
     "list": ("group",),
@@ -74,6 +76,7 @@ other spin. On two busy cores matrix products of ``go1exp gap`` took 40 times as
 PATH_KEYS = {
     *("run", "resume", "start_from", "policy", "checkpoint", "logs", "recordings", "files", "file", "path", "bundle"),
     *("out", "dir", "mjcf", "baseline", "folder", "options", "columns", "motion", "feet", "plugins"),
+    *("network", "spec"),
 }
 """Last words of the keys whose value is a file, a folder or a name, which may hold =."""
 

@@ -1,0 +1,495 @@
+"""Policies of other frameworks (ONNX, TorchScript) as bundles: a contract between their network and this robot.
+
+Everything of the contract is in the bundle's graph, around the network; the runtime knows nothing of its origin.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import warnings
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal, cast
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from go1exp import robot
+from go1exp.config.choices import UNREADABLE
+from go1exp.config.compose import compose
+from go1exp.config.hydra_adapter import read_yaml
+from go1exp.config.schema import settings as schema
+from go1exp.config.schema.history import frame_width, frames_of, width
+from go1exp.config.schema.joint_values import JointValues, spread
+from go1exp.config.schema.registry import ConfigError, Positive, Term, unknown_name
+from go1exp.deploy.export.graph import OPSET, OUTPUTS, PAST, ExportError, Sensed, _exported, _quiet, required_inputs
+from go1exp.deploy.runtime.metadata import Port
+from go1exp.mdp.types import Snapshot
+from go1exp.sim.task import TrainConfig, parse_train
+
+ORDERS = {
+    "sdk": robot.JOINTS,
+    "leg_major": tuple(f"{leg}_{kind}" for leg in ("FL", "FR", "RL", "RR") for kind in robot.JOINT_KINDS),
+    "joint_major": tuple(f"{leg}_{kind}" for kind in robot.JOINT_KINDS for leg in ("FL", "FR", "RL", "RR")),
+}
+"""Orders of the joints: of the vendor's SDK and mjlab, of legged_gym, of Isaac Lab."""
+
+ALIASES = {
+    **dict.fromkeys(("base_lin_vel", "lin_vel"), "base_linear_velocity"),
+    **dict.fromkeys(("base_ang_vel", "ang_vel"), "base_angular_velocity"),
+    **dict.fromkeys(("gravity",), "projected_gravity"),
+    **dict.fromkeys(("velocity_commands", "commands", "command"), "velocity_command"),
+    **dict.fromkeys(("joint_pos", "joint_pos_rel", "dof_pos"), "joint_position"),
+    **dict.fromkeys(("joint_vel", "joint_vel_rel", "dof_vel"), "joint_velocity"),
+    **dict.fromkeys(("actions", "action", "last_action"), "previous_action"),
+}
+"""Names of observation terms elsewhere -> the registered ones."""
+
+STANCE = tuple(map(float, robot.NOMINAL_STANCE))
+_TERMS = ("base_lin_vel", "base_ang_vel", "projected_gravity", "velocity_commands", "joint_pos", "joint_vel", "actions")
+_GYM: dict[str, Any] = {
+    "observation": [
+        {"term": "lin_vel", "scale": 2.0},
+        {"term": "ang_vel", "scale": 0.25},
+        {"term": "projected_gravity"},
+        {"term": "commands", "scale": [2.0, 2.0, 0.25]},
+        {"term": "dof_pos"},
+        {"term": "dof_vel", "scale": 0.05},
+        {"term": "actions"},
+    ],
+    "observation_clip": 100.0,
+    "joint_order": "leg_major",
+}
+PRESETS: dict[str, dict[str, Any]] = {
+    "isaaclab": {"observation": [{"term": name} for name in _TERMS], "joint_order": "joint_major"},
+    "mjlab": {
+        "observation": [{"term": _TERMS[k]} for k in (0, 1, 2, 4, 5, 6, 3)],
+        "joint_order": "sdk",
+        "default_pose": {"FR_hip": 0.1, "RR_hip": 0.1, "FL_hip": -0.1, "RL_hip": -0.1, "thigh": 0.9, "calf": -1.8},
+        "kp": [15.895, 15.895, 35.764],
+        "kd": [1.012, 1.012, 2.277],
+        "action_scale": [0.3728, 0.3728, 0.2485],
+    },
+    "legged_gym": _GYM,
+    "unitree_rl": _GYM,
+}
+"""Contracts of the velocity tasks of Isaac Lab, mjlab, legged_gym (A1) and unitree_rl_gym (Go2)."""
+
+
+@schema.settings
+class Observed:
+    """One term of a foreign observation: scale x clipped value.
+
+    Attributes:
+        term: name, registered here or of the other framework.
+        scale: factor, one or one for each number.
+        clip: bound of the value before the scale.
+        history: frames; null takes that of the specification.
+        quaternion: how training took the attitude; inverse and xyzw are mistakes that a policy may have learnt.
+        relative: joint positions are relative to the default pose.
+        parameters: of the registered term.
+    """
+
+    term: str
+    scale: float | tuple[float, ...] = 1.0
+    clip: Positive | None = None
+    history: Annotated[int, Field(ge=1, le=64)] | None = None
+    quaternion: Literal["wxyz", "xyzw", "inverse"] = "wxyz"
+    relative: bool = True
+    parameters: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+
+@schema.settings
+class Spec:
+    """The contract of a foreign policy. Lists of 12 are in ``joint_order``; lists of 3 are hip, thigh, calf.
+
+    Attributes:
+        observation: terms, in the order of the network's input.
+        observation_clip: bound of the scaled observation.
+        joint_order: sdk, leg_major, joint_major, or the 12 names.
+        joint_sign: 1 or -1, of the foreign joint's direction.
+        default_pose: targets of zero action, rad.
+        kp: N m/rad.
+        kd: N m s/rad.
+        action_scale: rad per unit of action.
+        action_clip: bound of an action.
+        physics_dt: physics step in training, s.
+        decimation: physics steps per policy step.
+        history: frames of each term.
+        history_order: whether the newest or the oldest frame comes first.
+        history_layout: the frames of a term together, or the terms of a frame.
+        command_ranges: lowest and highest command of training: lin_vel_x, lin_vel_y (m/s), ang_vel_z (rad/s).
+    """
+
+    observation: Annotated[tuple[Observed, ...], Field(min_length=1)]
+    observation_clip: Positive | None = None
+    joint_order: str | tuple[str, ...]
+    joint_sign: JointValues = 1.0
+    default_pose: JointValues = dataclasses.field(default_factory=lambda: dict(zip(robot.JOINTS, STANCE, strict=True)))
+    kp: JointValues = 20.0
+    kd: JointValues = 0.5
+    action_scale: JointValues = 0.25
+    action_clip: Positive = 100.0
+    physics_dt: Annotated[float, Field(gt=0, le=0.02)] = 0.005
+    decimation: Annotated[int, Field(ge=1, le=100)] = 4
+    history: Annotated[int, Field(ge=1, le=64)] = 1
+    history_order: Literal["newest_first", "oldest_first"] = "oldest_first"
+    history_layout: Literal["term", "frame"] = "term"
+    command_ranges: dict[str, tuple[float, float]] = dataclasses.field(
+        default_factory=lambda: dict.fromkeys(("lin_vel_x", "lin_vel_y", "ang_vel_z"), (-1.0, 1.0))
+    )
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The joints in foreign order, by their names here."""
+        given = ORDERS.get(self.joint_order, ()) if isinstance(self.joint_order, str) else self.joint_order
+        names = tuple(name.removesuffix("_joint") for name in given)
+        if sorted(names) != sorted(robot.JOINTS):
+            raise ConfigError(
+                [
+                    f"joint_order = {self.joint_order!r}: must be {', '.join(ORDERS)}, or the 12 names "
+                    f"{', '.join(robot.JOINTS)}"
+                ]
+            )
+        return names
+
+    def joints(self, key: str) -> np.ndarray:
+        """Return a value per joint (12,), in foreign order."""
+        values, names = getattr(self, key), self.names
+        try:
+            if isinstance(values, tuple) and len(values) == len(names):
+                given = np.array(values)
+            else:
+                given = spread(values, robot.JOINTS)[[robot.JOINTS.index(name) for name in names]]
+        except ValueError as error:
+            raise ConfigError([f"{key}: {error}"]) from None
+        bad = ~np.isfinite(given) | (
+            np.abs(given) != 1 if key == "joint_sign" else key == "action_scale" and given == 0
+        )
+        if np.any(bad) or (key in ("kp", "kd") and np.any(given < 0)):
+            raise ConfigError([f"{key} = {values!r}: has no valid value for {names[int(np.argmax(bad))]}"])
+        return given
+
+
+def spec_of(given: str, props: Mapping[str, str]) -> tuple[Spec, list[str]]:
+    """Return the contract that a preset's name or a YAML file states, and notes on the file's own metadata.
+
+    The file's own metadata replace the preset's values; the YAML file's replace both.
+
+    Args:
+        given: a name of ``PRESETS``, or a file, whose key ``preset`` may name one.
+        props: metadata of the ONNX file (``joint_names``, ``joint_stiffness``, ... as Isaac Lab and mjlab write them).
+    """
+    stated: dict[str, Any] = {}
+    preset = given
+    if given not in PRESETS:
+        if not Path(given).is_file():
+            hint = unknown_name("spec", given, PRESETS, "preset")
+            raise ConfigError([f"{hint}; or a YAML file"])
+        try:
+            read = read_yaml(Path(given))
+        except UNREADABLE as error:
+            raise ConfigError([f"spec = {given!r}: not a YAML file ({type(error).__name__})"]) from None
+        if not isinstance(read, dict):
+            raise ConfigError([f"spec = {given!r}: must be a mapping"])
+        stated = dict(read)
+        preset = stated.pop("preset", "")
+        if preset and preset not in PRESETS:
+            raise ConfigError([unknown_name("preset", preset, PRESETS, "preset")])
+    base = PRESETS.get(preset, {})
+    own = _of_props(props, base.get("observation", []))
+    notes = [f"note: {key} is the spec's; the file has its own, too" for key in own if key in stated]
+    if own:
+        notes.insert(0, f"read from the file: {', '.join(own)}")
+    merged = {**base, **own, **stated}
+    if isinstance(merged.get("observation"), list):
+        merged["observation"] = [{"term": e} if isinstance(e, str) else e for e in merged["observation"]]
+    for key in ("observation", "joint_order"):
+        if key not in merged:
+            raise ConfigError([f"{key}: required in {given}, or preset: {', '.join(PRESETS)}"])
+    return schema.parse(Spec, merged), notes
+
+
+def _of_props(props: Mapping[str, str], known: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the part of a contract that an ONNX file's metadata state."""
+    keys = {"joint_stiffness": "kp", "joint_damping": "kd", "default_joint_pos": "default_pose"}
+    own: dict[str, Any] = {}
+    if "joint_names" in props:
+        own["joint_order"] = [name.strip() for name in props["joint_names"].split(",")]
+    for prop, key in {**keys, "action_scale": "action_scale"}.items():
+        try:
+            values = [float(v) for v in props[prop].strip("[]").split(",")] if prop in props else []
+        except ValueError:
+            raise ConfigError([f"{prop} = {props[prop]!r}: metadata of the file must be numbers"]) from None
+        if values:
+            own[key] = values[0] if len(values) == 1 else values
+    if "observation_names" in props:
+        usual = {ALIASES.get(entry["term"], entry["term"]): entry for entry in known}
+        names = [name.strip() for name in props["observation_names"].split(",")]
+        own["observation"] = [usual.get(ALIASES.get(name, name), {"term": name}) for name in names]
+    return own
+
+
+def config_of(spec: Spec) -> tuple[dict[str, Any], TrainConfig]:
+    """Return a training configuration of a contract, as plain data and parsed: its robot, terms, gains and rates."""
+    container = compose("train", ["actuator=pd", "command=paper", "rand=none", "event=none", "backend.threads=1"])
+    inverse = [spec.names.index(name) for name in robot.JOINTS]
+    names = [ALIASES.get(o.term, o.term) for o in spec.observation]
+    if twice := {name for name in names if names.count(name) > 1}:
+        raise ConfigError([f"observation: {', '.join(sorted(twice))} given twice"])
+    container["observation"] = {
+        name: {**o.parameters, "history": o.history or spec.history}
+        for name, o in zip(names, spec.observation, strict=True)
+    }
+    container["actuator"] = {"term": "pd", **{k: spec.joints(k)[inverse].tolist() for k in ("kp", "kd")}}
+    scale, period = spec.joints("action_scale"), spec.physics_dt * spec.decimation
+    unit = float(np.max(np.abs(scale)))
+    shift = np.abs(spec.joints("joint_sign") * spec.joints("default_pose") - _stance(spec))
+    clip = float(np.max((spec.action_clip * np.abs(scale) + shift) / unit))
+    container["action"] = {"scale": unit, "clip": clip}
+    # contacts of MuJoCo take steps of about 2 ms, whatever the other engine's were
+    container["sim"] |= {"policy_dt": period, "physics_dt": period / int(np.ceil(period / 0.002 - 1e-9))}
+    container["command"] |= {axis: list(pair) for axis, pair in spec.command_ranges.items()}
+    return container, parse_train(container)
+
+
+def _stance(spec: Spec) -> np.ndarray:
+    return np.array([STANCE[robot.JOINTS.index(name)] for name in spec.names])
+
+
+class Front(nn.Module):
+    """Sensor readings to the flat observation, a frame after the other in each term, and to the network's input."""
+
+    def __init__(self, spec: Spec, config: TrainConfig) -> None:
+        """Prepare the terms; raise ConfigError or ExportError if one does not fit."""
+        super().__init__()
+        self._terms: tuple[Term, ...] = config.task.observation
+        self._spec, unit = spec, config.task.action.scale
+        order = [robot.JOINTS.index(name) for name in spec.names]
+        sign, pose, stance = spec.joints("joint_sign"), spec.joints("default_pose"), _stance(spec)
+        scale = spec.joints("action_scale")
+        shifts = {"joint_position": sign * stance - pose, "previous_action": (sign * stance - pose) / scale}
+        gains = {"previous_action": sign * unit / scale}
+        self._offset = bool(np.any(shifts["previous_action"]))
+        self._laws: list[tuple[list[int], Tensor, Tensor, Tensor]] = []
+        for term, seen in zip(self._terms, spec.observation, strict=True):
+            per_joint = term.entry.name.startswith(("joint_", "previous_action"))
+            size, name = frame_width(term), term.entry.name
+            factor = np.array(seen.scale, dtype=float)
+            if factor.ndim and len(factor) != size:
+                raise ConfigError([f"observation.{seen.term}.scale: {len(factor)} values for {size} numbers"])
+            gain = gains.get(name, sign) if per_joint else np.ones(size)
+            shift = shifts.get(name, np.zeros(size))
+            if name == "joint_position" and not seen.relative:
+                shift = sign * stance
+            law = (torch.as_tensor(v, dtype=torch.float32) for v in (gain, shift, factor * np.ones(size)))
+            self._laws.append((order if per_joint else list(range(size)), *law))  # type: ignore[arg-type]
+        self._earlier = [width(t) - frame_width(t) for t in self._terms]
+        self.size = sum(map(width, self._terms))
+        past = (dataclasses.replace(PAST, size=sum(self._earlier)),) if any(self._earlier) else ()
+        self.inputs = (*required_inputs(self._terms), *past)
+        self._columns = self._layout()
+
+    def _layout(self) -> list[int]:
+        """Return where each number of the network's input is in the observation."""
+        start, frames = 0, []
+        for term in self._terms:
+            steps = np.arange(width(term)).reshape(frames_of(term), -1) + start
+            frames.append(steps if self._spec.history_order == "newest_first" else steps[::-1])
+            start += width(term)
+        if self._spec.history_layout == "term" or not any(self._earlier):
+            return [int(c) for term in frames for c in term.ravel()]
+        if len({len(term) for term in frames}) > 1:
+            raise ConfigError(["history_layout = 'frame': every term must have as many frames"])
+        return [int(c) for step in zip(*frames, strict=True) for term in step for c in term]
+
+    def forward(self, *readings: Tensor) -> tuple[Tensor, Tensor]:
+        """Return observation and network input, (N, O) each, for readings (N, size)."""
+        given = dict(zip([port.name for port in self.inputs], readings, strict=True))
+        frames = []
+        for term, seen, law in zip(self._terms, self._spec.observation, self._laws, strict=True):
+            value = term(cast(Snapshot, Sensed(_attitude(given, seen.quaternion), term.key)))
+            columns, gain, shift, factor = law
+            changed = value[:, columns] * gain + shift
+            if term.entry.name == "previous_action" and self._offset:  # there was none before the first step
+                changed = changed * (value.abs().sum(-1, keepdim=True) > 0).to(changed.dtype)
+            if seen.clip is not None:
+                changed = changed.clamp(-seen.clip, seen.clip)
+            changed = changed * factor
+            bound = self._spec.observation_clip
+            frames.append(changed if bound is None else changed.clamp(-bound, bound))
+        if any(self._earlier):
+            frames = [torch.cat(p, -1) for p in zip(frames, given["past"].split(self._earlier, -1), strict=True)]
+        observation = torch.cat(frames, dim=-1)
+        return observation, observation[:, self._columns]
+
+
+def _attitude(given: Mapping[str, Tensor], kind: str) -> dict[str, Tensor]:
+    if kind == "wxyz" or "imu_quat" not in given:
+        return dict(given)
+    quat = given["imu_quat"]
+    conjugate = torch.cat([quat[:, :1], -quat[:, 1:]], dim=-1)
+    return {**given, "imu_quat": conjugate if kind == "inverse" else quat[:, [1, 2, 3, 0]]}
+
+
+class Back(nn.Module):
+    """The network's output to joint targets and to the action of this project, both in the order of ``JOINTS``."""
+
+    def __init__(self, spec: Spec, config: TrainConfig) -> None:
+        """Prepare the change of order, sign, scale and offset."""
+        super().__init__()
+        self._inverse = [spec.names.index(name) for name in robot.JOINTS]
+        sign, unit = spec.joints("joint_sign")[self._inverse], config.task.action.scale
+        pose, scale = (spec.joints(key)[self._inverse] for key in ("default_pose", "action_scale"))
+        stance = robot.NOMINAL_STANCE
+        laws = (sign * scale / unit, (sign * pose - stance) / unit, stance)
+        self._gain, self._shift, self._stance = (torch.as_tensor(v, dtype=torch.float32) for v in laws)
+        self._clip, self._unit, self._bound = spec.action_clip, unit, config.task.action.clip
+
+    def forward(self, *readings: Tensor) -> tuple[Tensor, Tensor]:
+        """Return joint targets, rad, and actions, (N, 12) each, for the raw actions (N, 12)."""
+        raw = readings[0][:, self._inverse].clamp(-self._clip, self._clip)
+        action = (raw * self._gain + self._shift).clamp(-self._bound, self._bound)
+        return self._stance + self._unit * action, action
+
+
+class Network:
+    """A foreign network in onnxruntime: (N, size) -> (N, 12).
+
+    Attributes:
+        model: its graph, with a free number of rows.
+        props: metadata of the file.
+        sha256: of the file.
+    """
+
+    def __init__(self, file: Path, size: int | None) -> None:
+        """Read a file; ``size`` is that of its input where the file does not say it.
+
+        Raises:
+            ExportError: if it is not the graph of one observation and one action, or remembers.
+        """
+        import onnx
+
+        data = file.read_bytes()
+        self.sha256 = hashlib.sha256(data).hexdigest()
+        if data[:2] == b"PK":
+            self.model = _converted(file, size)
+        else:
+            try:
+                self.model = onnx.load(str(file))
+                onnx.checker.check_model(self.model)
+            except Exception as error:  # protobuf's, the checker's and the file system's errors have no common class
+                reason = str(error).strip().partition("\n")[0]
+                raise ExportError(f"{file}: neither ONNX nor TorchScript ({reason})") from None
+        self.props = {p.key: p.value for p in self.model.metadata_props}
+        stored = {i.name for i in self.model.graph.initializer}
+        inputs = [i for i in self.model.graph.input if i.name not in stored]
+        if len(inputs) != 1:
+            names = ", ".join(i.name for i in inputs)
+            raise ExportError(f"{file}: has the inputs {names}; one observation is needed, and no recurrent state")
+        outputs = {o.name: o for o in self.model.graph.output}
+        output = next((outputs[n] for n in ("actions", "action") if n in outputs), self.model.graph.output[0])
+        self.input, self.output = inputs[0].name, output.name
+        shape = inputs[0].type.tensor_type.shape.dim
+        self.size = int(shape[-1].dim_value) if shape and shape[-1].dim_value else None
+        for value in (inputs[0], *outputs.values()):
+            if value.type.tensor_type.shape.dim:
+                value.type.tensor_type.shape.dim[0].dim_param = "rows"
+        del self.model.graph.value_info[:]
+        import onnxruntime as ort
+
+        options = ort.SessionOptions()
+        options.intra_op_num_threads, options.log_severity_level = 1, 4
+        self._session = ort.InferenceSession(self.model.SerializeToString(), options, ["CPUExecutionProvider"])
+        self._check(file, self.size or size)
+
+    def _check(self, file: Path, size: int | None) -> None:
+        if size is None:
+            return
+        probe = np.random.default_rng(0).normal(size=(3, size)).astype(np.float32)
+        try:
+            rows, each = self(probe), np.concatenate([self(probe[k : k + 1]) for k in range(3)])
+        except Exception as error:  # of classes that onnxruntime does not export
+            reason = str(error).strip().partition("\n")[0]
+            raise ExportError(f"{file}: does not take rows of {size} numbers ({reason}); export dynamic rows") from None
+        if rows.shape != (3, robot.NUM_JOINTS):
+            raise ExportError(f"{file}: output {self.output} has {rows.shape[-1]} numbers; 12 actions are needed")
+        if not np.allclose(rows, each, rtol=1e-4, atol=1e-4) or not np.array_equal(each, each):
+            raise ExportError(f"{file}: rows act on one another, or it is not a function of its input")
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Return raw actions for rows of the network's input, float32."""
+        return cast(np.ndarray, self._session.run([self.output], {self.input: observation})[0])
+
+
+def _converted(file: Path, size: int | None) -> Any:
+    """Return the ONNX graph of a TorchScript file."""
+    import onnx
+
+    try:
+        script = torch.jit.load(str(file), map_location="cpu").eval()
+    except RuntimeError:
+        raise ExportError(
+            f"{file}: not TorchScript; a checkpoint of weights has no network: export policy.pt or policy.onnx first"
+        ) from None
+    if size is None:
+        raise ExportError(f"{file}: TorchScript does not say the size of its input; give spec=")
+    probe, made = torch.linspace(-1, 1, 2 * size).reshape(2, size), io.BytesIO()
+    try:
+        with torch.no_grad(), _quiet(), warnings.catch_warnings():
+            wanted = script(probe)
+            if not torch.equal(wanted, script(probe)):
+                raise ExportError(f"{file}: gives other actions the second time: recurrent policies are not imported")
+            rows = {"obs": {0: "rows"}, "actions": {0: "rows"}}
+            torch.onnx.export(
+                script, (probe,), made, dynamo=False, opset_version=17, input_names=["obs"], output_names=["actions"],
+                dynamic_axes=rows,
+            )  # fmt: skip
+    except ExportError:
+        raise
+    except Exception as error:  # torch raises whatever the user's code and its converter do
+        reason = str(error).strip().partition("\n")[0]
+        raise ExportError(
+            f"{file}: TorchScript that does not take {size} numbers or has no form in ONNX ({reason})"
+        ) from None
+    return onnx.load_from_string(made.getvalue())
+
+
+def compose_graph(front: Front, back: Back, network: Network) -> bytes:
+    """Return the bundle's graph: front, network and back in one.
+
+    Raises:
+        ExportError: if the network's operators cannot be brought to this version of ONNX.
+    """
+    import onnx
+    from onnx import compose as join
+    from onnx import version_converter
+
+    head = _exported(front, front.inputs, ["observation", "network_input"])
+    tail = _exported(back, (Port("raw", robot.NUM_JOINTS, "1", "joint", ""),), ["joint_target", "action"])
+    try:
+        middle = version_converter.convert_version(network.model, OPSET)
+    except Exception as error:  # the converter's are C++ exceptions without a class
+        raise ExportError(f"its operators cannot be converted to opset {OPSET} ({error})") from None
+    del middle.metadata_props[:]
+    middle.ir_version = tail.ir_version = head.ir_version
+    middle, tail = join.add_prefix(middle, "network_"), join.add_prefix(tail, "back_")
+    first = join.merge_models(head, middle, io_map=[("network_input", f"network_{network.input}")])
+    whole = join.merge_models(first, tail, io_map=[(f"network_{network.output}", "back_raw")])
+    names = {"back_joint_target": "joint_target", "back_action": "action", "observation": "observation"}
+    for node in whole.graph.node:
+        node.output[:] = [names.get(name, name) for name in node.output]
+        node.input[:] = [names.get(name, name) for name in node.input]
+    for value in whole.graph.output:
+        value.name = names.get(value.name, value.name)
+    by_name = {value.name: value for value in whole.graph.output}
+    del whole.graph.output[:], whole.graph.value_info[:], whole.metadata_props[:]
+    whole.graph.output.extend(by_name[port.name] for port in OUTPUTS)
+    whole.producer_name, whole.graph.name = "go1exp", "policy"
+    onnx.checker.check_model(whole, full_check=True)
+    return bytes(whole.SerializeToString())

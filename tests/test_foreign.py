@@ -1,0 +1,129 @@
+"""Policies of other frameworks: a shipped network in their conventions acts as it does; a wrong contract is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from torch import nn
+
+from go1exp import robot
+from go1exp.base.paths import data_root
+from go1exp.config.schema.registry import ConfigError
+from go1exp.deploy.export.contract import alternatives, build_foreign
+from go1exp.deploy.export.foreign import ORDERS, PRESETS, Back, Front, Network, compose_graph, config_of, spec_of
+from go1exp.deploy.export.graph import ExportError
+from go1exp.deploy.runtime.policy import OnnxPolicy
+from go1exp.train import run_folder
+from go1exp.train.policy import load_network
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
+
+PLACES = {"base_linear_velocity": 0, "base_angular_velocity": 3, "projected_gravity": 6, "velocity_command": 9}
+PLACES |= {"joint_position": 12, "joint_velocity": 24, "previous_action": 36}
+
+
+class InTheirs(nn.Module):
+    """The shipped network, as another framework would have trained it: its order, scales and units of action."""
+
+    def __init__(self, spec) -> None:  # type: ignore[no-untyped-def]
+        super().__init__()
+        run = data_root() / "assets/policies/trot"
+        config = run_folder.read_parsed(run)
+        self.net, _ = load_network(run, config.ppo, None)
+        self.net = nn.Sequential(self.net.mlp_extractor.policy_net, self.net.action_net)
+        front = Front(spec, config_of(spec)[1])
+        inverse = [spec.names.index(name) for name in robot.JOINTS]
+        order, gain = [], []
+        start = 0
+        columns = {}
+        for term, law in zip(front._terms, front._laws, strict=True):
+            size = len(law[0])
+            columns[term.entry.name] = (start, inverse if size == 12 else [0, 1, 2], 1.0 / law[3])
+            start += size
+        for name in PLACES:
+            at, index, factor = columns[name]
+            order += [at + k for k in index]
+            gain += [float(factor[k]) for k in index]
+        self.order, self.gain = order, torch.tensor(gain)
+        self.joints = [robot.JOINTS.index(name) for name in spec.names]
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        return self.net(obs[:, self.order] * self.gain)[:, self.joints]
+
+
+def contract(tmp_path: Path, preset: str) -> str:
+    """A file: the preset's observation and order, with pose, gains and scale of the shipped policy."""
+    stance = ", ".join(f"{n}: {v}" for n, v in zip(robot.JOINTS, robot.NOMINAL_STANCE, strict=True))
+    file = tmp_path / f"{preset}.yaml"
+    file.write_text(
+        f"preset: {preset}\ndefault_pose: {{{stance}}}\nkp: 20.0\nkd: 0.5\naction_scale: 0.2\n"
+        "command_ranges: {lin_vel_x: [-2, 3]}\n"
+    )
+    return str(file)
+
+
+def exported(module: nn.Module, file: Path) -> Path:
+    torch.jit.trace(module.eval(), torch.zeros(2, 48)).save(str(file))
+    return file
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_network_in_their_convention_acts_as_the_original(preset: str, tmp_path: Path) -> None:
+    spec, _ = spec_of(contract(tmp_path, preset), {})
+    theirs = InTheirs(spec)
+    front, back = Front(spec, config_of(spec)[1]), Back(spec, config_of(spec)[1])
+    network = Network(exported(theirs, tmp_path / "policy.pt"), front.size)
+    rng = np.random.default_rng(0)
+    given = {p.name: torch.tensor(rng.normal(size=(50, p.size)), dtype=torch.float32) for p in front.inputs}
+    given["imu_quat"] = nn.functional.normalize(given["imu_quat"])
+    ours, _ = spec_of(contract(tmp_path, "isaaclab"), {})
+    plain = Front(type(ours)(**{**ours.__dict__, "joint_order": "sdk"}), config_of(ours)[1])
+    wanted = theirs.net(plain(*[given[p.name] for p in plain.inputs])[0]).detach()
+    with torch.no_grad():
+        made = OnnxPolicy(
+            compose_graph(front, back, network),
+            front.inputs,
+            tuple(
+                type(front.inputs[0])(n, s, "", "", "")
+                for n, s in (("joint_target", 12), ("observation", 48), ("action", 12))
+            ),
+        )
+    got = made({name: values.numpy() for name, values in given.items()})
+    np.testing.assert_allclose(got["action"], wanted, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(got["joint_target"], robot.NOMINAL_STANCE + 0.2 * wanted.numpy(), rtol=0, atol=1e-4)
+
+
+def test_a_wrong_joint_order_is_named(tmp_path: Path) -> None:
+    spec, _ = spec_of(contract(tmp_path, "isaaclab"), {})
+    file = exported(InTheirs(spec), tmp_path / "policy.pt")
+    wrong = tmp_path / "wrong.yaml"
+    wrong.write_text(Path(contract(tmp_path, "isaaclab")).read_text() + "joint_order: sdk\n")
+    with pytest.raises(ExportError, match="likely mismatch.*joint_order=joint_major"):
+        build_foreign(file, str(wrong))
+
+
+def test_metadata_of_the_file_and_sizes(tmp_path: Path) -> None:
+    props = {
+        "joint_names": ",".join(f"{n}_joint" for n in ORDERS["leg_major"]),
+        "observation_names": "base_ang_vel,joint_pos,actions",
+        "joint_stiffness": ",".join(str(k) for k in range(12)),
+        "action_scale": "0.3",
+    }
+    spec, notes = spec_of("mjlab", props)
+    assert spec.names == ORDERS["leg_major"]
+    assert [o.term for o in spec.observation] == ["base_ang_vel", "joint_pos", "actions"]
+    assert spec.joints("kp").tolist() == list(range(12))
+    assert "joint_order" in notes[0]
+    made = tmp_path / "p.onnx"
+    node = onnx.helper.make_node("MatMul", ["obs", "W"], ["actions"])
+    weights = onnx.numpy_helper.from_array(np.zeros((45, 12), np.float32), "W")
+    ports = [onnx.helper.make_tensor_value_info(n, 1, [1, s]) for n, s in (("obs", 45), ("actions", 12))]
+    graph = onnx.helper.make_graph([node], "p", ports[:1], ports[1:], [weights])
+    onnx.save(onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8), made)
+    with pytest.raises(ConfigError, match="48 numbers .*the network takes 45"):
+        build_foreign(made, "legged_gym")
+    assert {name.partition(":")[0] for name, _ in alternatives(spec_of("isaaclab", {})[0])} >= {"joint order", "sign"}
