@@ -31,7 +31,7 @@ class InTheirs(nn.Module):
 
     def __init__(self, spec) -> None:  # type: ignore[no-untyped-def]
         super().__init__()
-        run = data_root() / "assets/policies/trot"
+        run = data_root() / "assets/policies/paper"
         config = run_folder.read_parsed(run)
         self.net, _ = load_network(run, config.ppo, None)
         self.net = nn.Sequential(self.net.mlp_extractor.policy_net, self.net.action_net)
