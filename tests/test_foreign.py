@@ -102,7 +102,7 @@ def test_a_wrong_joint_order_is_named(tmp_path: Path) -> None:
     file = exported(InTheirs(spec), tmp_path / "policy.pt")
     wrong = tmp_path / "wrong.yaml"
     wrong.write_text(Path(contract(tmp_path, "isaaclab")).read_text() + "joint_order: sdk\n")
-    with pytest.raises(ExportError, match="likely mismatch.*joint_order=joint_major"):
+    with pytest.raises(ExportError, match=r"likely mismatch.*joint_order=joint_major"):
         build_foreign(file, str(wrong))
 
 
@@ -124,6 +124,6 @@ def test_metadata_of_the_file_and_sizes(tmp_path: Path) -> None:
     ports = [onnx.helper.make_tensor_value_info(n, 1, [1, s]) for n, s in (("obs", 45), ("actions", 12))]
     graph = onnx.helper.make_graph([node], "p", ports[:1], ports[1:], [weights])
     onnx.save(onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8), made)
-    with pytest.raises(ConfigError, match="48 numbers .*the network takes 45"):
+    with pytest.raises(ConfigError, match=r"48 numbers .*the network takes 45"):
         build_foreign(made, "legged_gym")
     assert {name.partition(":")[0] for name, _ in alternatives(spec_of("isaaclab", {})[0])} >= {"joint order", "sign"}
