@@ -119,6 +119,7 @@ EXEMPT = {
             ("gap", "search.phase", "of robots that walk: test_gap_swings"),
             ("gap", "host port", "of the stage view: test_viewer_keys"),
             ("gap_next", "logs out design", "test_gap_next"),
+            ("export_import", "network spec out force", "test_foreign"),
             ("gap_loop", "effect excitation gains seconds seeds repeats support hang physics_dt seed", "record.yaml"),
             ("gap_loop", "rounds sensors search design out", "gap.yaml, gap_next.yaml, test_gap_loop"),
             ("compare", "subjects same_robot seed physics_dt folder", "test_protocol_commands"),

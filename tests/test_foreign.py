@@ -14,7 +14,8 @@ from go1exp import robot
 from go1exp.base.paths import data_root
 from go1exp.config.schema.registry import ConfigError
 from go1exp.deploy.export.contract import alternatives, build_foreign
-from go1exp.deploy.export.foreign import ORDERS, PRESETS, Back, Front, Network, compose_graph, config_of, spec_of
+from go1exp.deploy.export.foreign import ORDERS, PRESETS, Back, Front, config_of, spec_of
+from go1exp.deploy.export.foreign_graph import Network, compose_graph
 from go1exp.deploy.export.graph import ExportError
 from go1exp.deploy.runtime.policy import OnnxPolicy
 from go1exp.train import run_folder

@@ -22,12 +22,11 @@ from go1exp.deploy.export.foreign import (
     STANCE,
     Back,
     Front,
-    Network,
     Spec,
-    compose_graph,
     config_of,
     spec_of,
 )
+from go1exp.deploy.export.foreign_graph import Network, compose_graph
 from go1exp.deploy.export.graph import OUTPUTS, ExportError
 from go1exp.deploy.runtime import bundle
 from go1exp.deploy.runtime.metadata import Trained
@@ -128,7 +127,8 @@ def alternatives(spec: Spec) -> Iterator[tuple[str, Spec]]:
         yield f"default pose: {name}", change(spec, default_pose=pose)
     usual = {ALIASES.get(e["term"], e["term"]): e for e in PRESETS["legged_gym"]["observation"]}
     for k, seen in enumerate(spec.observation):
-        name, others = ALIASES.get(seen.term, seen.term), []
+        name = ALIASES.get(seen.term, seen.term)
+        others: list[tuple[str, dict[str, Any]]] = []
         if name == "projected_gravity":
             others = [("gravity frame: sign", {"scale": tuple(-np.broadcast_to(seen.scale, 3))})]
             others += [("gravity frame: quaternion=inverse", {"quaternion": "inverse"})]
