@@ -13,7 +13,7 @@ from torch import nn
 from go1exp import robot
 from go1exp.base.paths import data_root
 from go1exp.config.schema.registry import ConfigError
-from go1exp.deploy.export.contract import alternatives, build_foreign
+from go1exp.deploy.export.contract import alternatives, at_rest, build_foreign
 from go1exp.deploy.export.foreign import ORDERS, PRESETS, Back, Front, config_of, spec_of
 from go1exp.deploy.export.foreign_graph import Network, compose_graph
 from go1exp.deploy.export.graph import ExportError
@@ -22,6 +22,8 @@ from go1exp.train import run_folder
 from go1exp.train.policy import load_network
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
+
+ABOUT = ("go1exp/deploy/export/", "go1exp/cli/export.py", "go1exp/config/schema/", "conf/export_import.yaml")
 
 PLACES = {"base_linear_velocity": 0, "base_angular_velocity": 3, "projected_gravity": 6, "velocity_command": 9}
 PLACES |= {"joint_position": 12, "joint_velocity": 24, "previous_action": 36}
@@ -72,6 +74,7 @@ def exported(module: nn.Module, file: Path) -> Path:
     return file
 
 
+@pytest.mark.slow(*ABOUT)
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_network_in_their_convention_acts_as_the_original(preset: str, tmp_path: Path) -> None:
     spec, _ = spec_of(contract(tmp_path, preset), {})
@@ -98,6 +101,7 @@ def test_a_network_in_their_convention_acts_as_the_original(preset: str, tmp_pat
     np.testing.assert_allclose(got["joint_target"], robot.NOMINAL_STANCE + 0.2 * wanted.numpy(), rtol=0, atol=1e-4)
 
 
+@pytest.mark.slow(*ABOUT)
 def test_a_wrong_joint_order_is_named(tmp_path: Path) -> None:
     spec, _ = spec_of(contract(tmp_path, "isaaclab"), {})
     file = exported(InTheirs(spec), tmp_path / "policy.pt")
@@ -128,3 +132,21 @@ def test_metadata_of_the_file_and_sizes(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"48 numbers .*the network takes 45"):
         build_foreign(made, "legged_gym")
     assert {name.partition(":")[0] for name, _ in alternatives(spec_of("isaaclab", {})[0])} >= {"joint order", "sign"}
+
+
+def test_first_targets_are_compared_with_the_own_pose_and_limit_of_each_joint(tmp_path: Path) -> None:
+    file = tmp_path / "spec.yaml"
+    file.write_text("preset: isaaclab\ndefault_pose: {hip: 0.0, thigh: 0.7, calf: -1.4}\nkp: [100.0, 20.0, 20.0]\n")
+    spec, _ = spec_of(str(file), {})
+    target = np.tile([0.0, 0.7, -1.4], 4)
+    assert at_rest(spec, target)[0].endswith(" 0% of its limit")
+    target[robot.JOINTS.index("FL_hip")] += 0.2
+    target[robot.JOINTS.index("RR_calf")] -= 1.0
+    said = at_rest(spec, target)
+    assert said == [
+        "first target: RR_calf -1.00 rad from its default pose; largest torque: FL_hip +20.0 N m, 84% of its limit"
+    ]
+    target[robot.JOINTS.index("FL_hip")] += 0.1
+    assert at_rest(spec, target)[1:] == ["warning: first targets with torques beyond the limit: FL_hip"]
+    target[robot.JOINTS.index("RL_thigh")] = -0.7
+    assert at_rest(spec, target)[2:] == ["warning: first targets beyond the stops: RL_thigh"]

@@ -53,8 +53,13 @@ class Outcome:
 
 def drive(
     config: TrainConfig, specs: Sequence[Spec], network: Network, seconds: float = SECONDS
-) -> tuple[list[Outcome], dict[str, np.ndarray]]:
-    """Run robots under each contract; return the outcomes, and a trace of the first robot of the first contract."""
+) -> tuple[list[Outcome], dict[str, np.ndarray], np.ndarray]:
+    """Run robots under each contract.
+
+    Returns:
+        The outcomes; of the first contract, a trace of the robot that walks forward, and the first joint targets of the
+        robot that stands, rad, (12,) in the order of ``JOINTS``.
+    """
     each, period = len(COMMANDS), config.task.sim.policy_dt
     sim = dataclasses.replace(config.task.sim, episode_s=2 * seconds, spread_starts=False)
     core = Go1Core(dataclasses.replace(config.task, sim=sim), each * len(specs), noise=False)
@@ -84,6 +89,8 @@ def drive(
                 inputs = {f"input.{p.name}": v[1:2] for p, v in zip(front.inputs, given, strict=True)}
         raw = torch.from_numpy(network(torch.cat(parts).numpy()))
         out = [back(raw[k * each : (k + 1) * each]) for k, back in enumerate(backs)]
+        if step == 0:
+            rest = out[0][0][0].numpy().astype(float)
         if np.isinf(fall[1]):
             made = dict(zip(("joint_target", "observation", "action"), (out[0][0], seen[0], out[0][1]), strict=True))
             row = {**inputs, **{f"output.{name}": values[1:2] for name, values in made.items()}}
@@ -100,7 +107,7 @@ def drive(
     follows = 1.0 - np.linalg.norm(mean, axis=-1) / np.linalg.norm(np.array(COMMANDS[1:]), axis=-1)
     first = fall.reshape(len(specs), each).min(axis=1)
     outcomes = [Outcome(float(f), float(v)) for f, v in zip(first, follows.mean(axis=1), strict=True)]
-    return outcomes, {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
+    return outcomes, {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}, rest
 
 
 def alternatives(spec: Spec) -> Iterator[tuple[str, Spec]]:
@@ -170,13 +177,13 @@ def build_foreign(file: Path, given: str, *, force: bool = False) -> tuple[bytes
         terms = ", ".join(f"{b.key} {b.entry.traits['size']}" for b in config.task.observation)
         raise ConfigError([f"observation: {front.size} numbers ({terms}); the network takes {network.size}"])
     with one_thread(), torch.no_grad():
-        (stated,), trace = drive(config, [spec], network)
-        lines += at_rest(spec, trace)
+        (stated,), trace, rest = drive(config, [spec], network)
+        lines += at_rest(spec, rest)
         likely = []
         if np.isfinite(stated.fall) or stated.follows < 1 - BETTER:
             names, others = zip(*alternatives(spec), strict=True)
             same = [(n, o) for n, o in zip(names, others, strict=True)]
-            outcomes, _ = drive(config, [o for _, o in same], network)
+            outcomes, _, _ = drive(config, [o for _, o in same], network)
             stands = [(r.follows, n) for r, (n, _) in zip(outcomes, same, strict=True) if np.isinf(r.fall)]
             least = -np.inf if np.isfinite(stated.fall) else stated.follows + BETTER
             likely = [f"{n} (follows {v:.0%})" for v, n in sorted(stands, reverse=True) if v > least][:3]
@@ -200,11 +207,26 @@ def build_foreign(file: Path, given: str, *, force: bool = False) -> tuple[bytes
     return data, lines
 
 
-def at_rest(spec: Spec, trace: dict[str, np.ndarray]) -> list[str]:
-    """Return what the first action asks of the joints at rest."""
-    target = trace["output.joint_target"][0].astype(float)
-    off, gains = target - robot.NOMINAL_STANCE, spec.joints("kp")[[spec.names.index(n) for n in robot.JOINTS]]
-    k, low, high = int(np.argmax(np.abs(off))), *robot.JOINT_POS_LIMITS.T
-    lines = [f"first target: {robot.JOINTS[k]} {off[k]:+.2f} rad from the stance, torque {gains[k] * off[k]:+.1f} N m"]
-    beyond = [n for n, t, a, b in zip(robot.JOINTS, target, low, high, strict=True) if not a <= t <= b]
-    return lines + ([f"warning: first targets beyond the stops: {', '.join(beyond)}"] if beyond else [])
+def at_rest(spec: Spec, target: np.ndarray) -> list[str]:
+    """Return what the first action of a standing robot asks of the joints.
+
+    Args:
+        spec: the contract.
+        target: joint targets, rad, (12,) in the order of ``JOINTS``.
+    """
+    order = [spec.names.index(name) for name in robot.JOINTS]
+    off = target - (spec.joints("joint_sign") * spec.joints("default_pose"))[order]
+    torque, limit = spec.joints("kp")[order] * off, np.tile(robot.EFFORT_LIMIT, robot.NUM_LEGS)
+    k, share, (low, high) = int(np.argmax(np.abs(off))), np.abs(torque) / limit, robot.JOINT_POS_LIMITS.T
+    most = int(np.argmax(share))
+    lines = [
+        f"first target: {robot.JOINTS[k]} {off[k]:+.2f} rad from its default pose; "
+        f"largest torque: {robot.JOINTS[most]} {torque[most]:+.1f} N m, {share[most]:.0%} of its limit"
+    ]
+    for what, wrong in (
+        ("with torques beyond the limit", share > 1),
+        ("beyond the stops", (target < low) | (target > high)),
+    ):
+        if np.any(wrong):
+            lines.append(f"warning: first targets {what}: {', '.join(np.array(robot.JOINTS)[wrong])}")
+    return lines
