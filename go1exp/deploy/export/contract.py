@@ -73,17 +73,17 @@ def drive(
     rows: list[dict[str, np.ndarray]] = []
     for step in range(steps):
         core.command.value.copy_(commands)
-        now, parts, seen = readings(core), [], []
+        now, parts, observations = readings(core), [], []
         for k, front in enumerate(fronts):
-            mine = {name: values[k * each : (k + 1) * each] for name, values in now.items()}
+            sensed = {name: values[k * each : (k + 1) * each] for name, values in now.items()}
             if past is None or history.earlier:
-                mine["past"] = torch.zeros(each, len(history.earlier)) if past is None else past[k]
-            given = [mine[port.name] for port in front.inputs]
+                sensed["past"] = torch.zeros(each, len(history.earlier)) if past is None else past[k]
+            given = [sensed[port.name] for port in front.inputs]
             if past is None and history.earlier:
-                mine["past"] = front(*given)[0][:, history.newest]
-                given = [mine[port.name] for port in front.inputs]
+                sensed["past"] = front(*given)[0][:, history.newest]
+                given = [sensed[port.name] for port in front.inputs]
             observation, wanted = front(*given)
-            seen.append(observation)
+            observations.append(observation)
             parts.append(wanted)
             if k == 0 and np.isinf(fall[1]):
                 inputs = {f"input.{p.name}": v[1:2] for p, v in zip(front.inputs, given, strict=True)}
@@ -92,10 +92,12 @@ def drive(
         if step == 0:
             rest = out[0][0][0].numpy().astype(float)
         if np.isinf(fall[1]):
-            made = dict(zip(("joint_target", "observation", "action"), (out[0][0], seen[0], out[0][1]), strict=True))
+            made = dict(
+                zip(("joint_target", "observation", "action"), (out[0][0], observations[0], out[0][1]), strict=True)
+            )
             row = {**inputs, **{f"output.{name}": values[1:2] for name, values in made.items()}}
             rows.append({"time": np.array([step * period]), **{k: v.numpy().copy() for k, v in row.items()}})
-        past = [o[:, history.carried] for o in seen]
+        past = [o[:, history.carried] for o in observations]
         result = core.step(torch.cat([action for _, action in out]))
         fall = np.where(result.terminated.numpy() & np.isinf(fall), (step + 1) * period, fall)
         s = core.snapshot()
@@ -133,21 +135,21 @@ def alternatives(spec: Spec) -> Iterator[tuple[str, Spec]]:
     for name, pose in stances.items():
         yield f"default pose: {name}", change(spec, default_pose=pose)
     usual = {ALIASES.get(e["term"], e["term"]): e for e in PRESETS["legged_gym"]["observation"]}
-    for k, seen in enumerate(spec.observation):
-        name = ALIASES.get(seen.term, seen.term)
+    for k, observed in enumerate(spec.observation):
+        name = ALIASES.get(observed.term, observed.term)
         others: list[tuple[str, dict[str, Any]]] = []
         if name == "projected_gravity":
-            others = [("gravity frame: sign", {"scale": tuple(-np.broadcast_to(seen.scale, 3))})]
+            others = [("gravity frame: sign", {"scale": tuple(-np.broadcast_to(observed.scale, 3))})]
             others += [("gravity frame: quaternion=inverse", {"quaternion": "inverse"})]
             others += [("quaternion order: quaternion=xyzw", {"quaternion": "xyzw"})]
         if name == "joint_position":
-            others = [(f"joint_position: relative={not seen.relative}", {"relative": not seen.relative})]
+            others = [(f"joint_position: relative={not observed.relative}", {"relative": not observed.relative})]
         for scale in (
             {1.0, usual.get(name, {}).get("scale", 1.0)} if name != "velocity_command" else {1.0, (2.0, 2.0, 0.25)}
         ):
-            others += [(f"scale: {name} x {scale}", {"scale": scale})] if scale != seen.scale else []
+            others += [(f"scale: {name} x {scale}", {"scale": scale})] if scale != observed.scale else []
         for text, values in others:
-            terms = [*spec.observation[:k], change(seen, **values), *spec.observation[k + 1 :]]
+            terms = [*spec.observation[:k], change(observed, **values), *spec.observation[k + 1 :]]
             yield text, change(spec, observation=tuple(terms))
 
 
@@ -189,12 +191,12 @@ def build_foreign(file: Path, given: str, *, force: bool = False) -> tuple[bytes
             likely = [f"{n} (follows {v:.0%})" for v, n in sorted(stands, reverse=True) if v > least][:3]
         model = compose_graph(front, back, network)
     what = f"falls after {stated.fall:.2f} s" if np.isfinite(stated.fall) else f"stands {SECONDS:g} s"
-    said = f"with the stated contract it {what} and follows the commands to {stated.follows:.0%}"
+    verdict = f"with the stated contract it {what} and follows the commands to {stated.follows:.0%}"
     if likely:
-        said += f"; likely mismatch, since it stands with: {'; '.join(likely)}"
+        verdict += f"; likely mismatch, since it stands with: {'; '.join(likely)}"
     if (likely or np.isfinite(stated.fall)) and not force:
-        raise ExportError(f"{file}: {said}; force=true imports it all the same")
-    lines.append(said)
+        raise ExportError(f"{file}: {verdict}; force=true imports it all the same")
+    lines.append(verdict)
     trained = Trained(file.name, network.sha256, 0, 0)
     size_of = {p.name: p.size or front.size for p in OUTPUTS}
     ports = type("Ports", (), {"inputs": front.inputs, "outputs": tuple(

@@ -198,11 +198,11 @@ def spec_of(given: str, props: Mapping[str, str]) -> tuple[Spec, list[str]]:
         if preset and preset not in PRESETS:
             raise ConfigError([unknown_name("preset", preset, PRESETS, "preset")])
     base = PRESETS.get(preset, {})
-    own = _of_props(props, base.get("observation", []))
-    notes = [f"note: {key} is the spec's; the file has its own, too" for key in own if key in stated]
-    if own:
-        notes.insert(0, f"read from the file: {', '.join(own)}")
-    merged = {**base, **own, **stated}
+    in_file = _of_props(props, base.get("observation", []))
+    notes = [f"note: {key} is the spec's; the file has its own, too" for key in in_file if key in stated]
+    if in_file:
+        notes.insert(0, f"read from the file: {', '.join(in_file)}")
+    merged = {**base, **in_file, **stated}
     if isinstance(merged.get("observation"), list):
         merged["observation"] = [{"term": e} if isinstance(e, str) else e for e in merged["observation"]]
     for key in ("observation", "joint_order"):
@@ -214,21 +214,21 @@ def spec_of(given: str, props: Mapping[str, str]) -> tuple[Spec, list[str]]:
 def _of_props(props: Mapping[str, str], known: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the part of a contract that an ONNX file's metadata state."""
     keys = {"joint_stiffness": "kp", "joint_damping": "kd", "default_joint_pos": "default_pose"}
-    own: dict[str, Any] = {}
+    in_file: dict[str, Any] = {}
     if "joint_names" in props:
-        own["joint_order"] = [name.strip() for name in props["joint_names"].split(",")]
+        in_file["joint_order"] = [name.strip() for name in props["joint_names"].split(",")]
     for prop, key in {**keys, "action_scale": "action_scale"}.items():
         try:
             values = [float(v) for v in props[prop].strip("[]").split(",")] if prop in props else []
         except ValueError:
             raise ConfigError([f"{prop} = {props[prop]!r}: metadata of the file must be numbers"]) from None
         if values:
-            own[key] = values[0] if len(values) == 1 else values
+            in_file[key] = values[0] if len(values) == 1 else values
     if "observation_names" in props:
         usual = {ALIASES.get(entry["term"], entry["term"]): entry for entry in known}
         names = [name.strip() for name in props["observation_names"].split(",")]
-        own["observation"] = [usual.get(ALIASES.get(name, name), {"term": name}) for name in names]
-    return own
+        in_file["observation"] = [usual.get(ALIASES.get(name, name), {"term": name}) for name in names]
+    return in_file
 
 
 def config_of(spec: Spec) -> tuple[dict[str, Any], TrainConfig]:
@@ -273,15 +273,15 @@ class Front(nn.Module):
         gains = {"previous_action": sign * unit / scale}
         self._offset = bool(np.any(shifts["previous_action"]))
         self._laws: list[tuple[list[int], Tensor, Tensor, Tensor]] = []
-        for term, seen in zip(self._terms, spec.observation, strict=True):
+        for term, observed in zip(self._terms, spec.observation, strict=True):
             per_joint = term.entry.name.startswith(("joint_", "previous_action"))
             size, name = frame_width(term), term.entry.name
-            factor = np.array(seen.scale, dtype=float)
+            factor = np.array(observed.scale, dtype=float)
             if factor.ndim and len(factor) != size:
-                raise ConfigError([f"observation.{seen.term}.scale: {len(factor)} values for {size} numbers"])
+                raise ConfigError([f"observation.{observed.term}.scale: {len(factor)} values for {size} numbers"])
             gain = gains.get(name, sign) if per_joint else np.ones(size)
             shift = shifts.get(name, np.zeros(size))
-            if name == "joint_position" and not seen.relative:
+            if name == "joint_position" and not observed.relative:
                 shift = sign * stance
             law = (torch.as_tensor(v, dtype=torch.float32) for v in (gain, shift, factor * np.ones(size)))
             self._laws.append((order if per_joint else list(range(size)), *law))  # type: ignore[arg-type]
@@ -308,14 +308,14 @@ class Front(nn.Module):
         """Return observation and network input, (N, O) each, for readings (N, size)."""
         given = dict(zip([port.name for port in self.inputs], readings, strict=True))
         frames = []
-        for term, seen, law in zip(self._terms, self._spec.observation, self._laws, strict=True):
-            value = term(cast(Snapshot, Sensed(_attitude(given, seen.quaternion), term.key)))
+        for term, observed, law in zip(self._terms, self._spec.observation, self._laws, strict=True):
+            value = term(cast(Snapshot, Sensed(_attitude(given, observed.quaternion), term.key)))
             columns, gain, shift, factor = law
             changed = value[:, columns] * gain + shift
             if term.entry.name == "previous_action" and self._offset:  # there was none before the first step
                 changed = changed * (value.abs().sum(-1, keepdim=True) > 0).to(changed.dtype)
-            if seen.clip is not None:
-                changed = changed.clamp(-seen.clip, seen.clip)
+            if observed.clip is not None:
+                changed = changed.clamp(-observed.clip, observed.clip)
             changed = changed * factor
             bound = self._spec.observation_clip
             frames.append(changed if bound is None else changed.clamp(-bound, bound))
