@@ -227,7 +227,6 @@ def announce(what: str) -> None:
 def spinner(total: int, what: str) -> Callable[[int, int], None]:
     """Return a callback ``(done, total)`` that shows a progress bar in a terminal, and lines elsewhere."""
     if not sys.stderr.isatty():
-        announce(what)
         printed_at = [time.monotonic()]
 
         def say(done: int, total: int) -> None:

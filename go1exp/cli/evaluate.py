@@ -314,6 +314,7 @@ def _grid(
     settings: Any, measures: list[Term], conditions: _Conditions, run: Path, checkpoint: Path | None, out: Path
 ) -> None:
     """Play the grid of constant commands."""
+    announce("evaluating")
     show = spinner(1, "evaluating")
     from go1exp.evaluate import criteria, rows, table
     from go1exp.evaluate.rollout import EvalConfig, delay_margin, evaluate, grid

@@ -344,10 +344,10 @@ def _wrong_steps(recordings: Sequence[Recording]) -> list[str]:
 
 def _unit_of(message: str, short: bool) -> str | None:
     """Return the unit of a clock that ``wrong_steps`` names; seconds where the steps are too short."""
-    found = next(
+    named = next(
         (unit for name, unit in (("millis", "ms"), ("micros", "us"), ("nanos", "ns")) if name in message), None
     )
-    return "s" if short else found
+    return "s" if short else named
 
 
 def _listed(names: Sequence[str]) -> str:

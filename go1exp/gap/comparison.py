@@ -138,11 +138,11 @@ def _possible(recordings: Sequence[Recording]) -> tuple[list[Recording], list[st
     """Return recordings without rows that their neighbours rule out, and a line for each; with too many, as it is."""
     kept, lines = [], []
     for r in recordings:
-        found = impossible(r)
-        few = 0.0 < found.rows.mean() <= MOST_IMPOSSIBLE
-        kept.append(without(r, found.rows) if few else r)
+        marked = impossible(r)
+        few = 0.0 < marked.rows.mean() <= MOST_IMPOSSIBLE
+        kept.append(without(r, marked.rows) if few else r)
         if few:
-            lines += [f"{r.meta.episode}: {f.channel}: {f.message}" for f in found.findings]
+            lines += [f"{r.meta.episode}: {f.channel}: {f.message}" for f in marked.findings]
     return kept, lines
 
 

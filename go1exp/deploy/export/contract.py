@@ -12,7 +12,7 @@ import torch
 
 from go1exp import robot
 from go1exp.base.tensors.threads import one_thread
-from go1exp.config.schema.history import history_columns
+from go1exp.config.schema.history import HistoryColumns, history_columns
 from go1exp.config.schema.registry import ConfigError
 from go1exp.deploy.export.build import _versions, metadata, readings
 from go1exp.deploy.export.foreign import (
@@ -51,6 +51,27 @@ class Outcome:
     follows: float
 
 
+def _look(
+    front: Front, sensed: dict[str, torch.Tensor], past: torch.Tensor | None, history: HistoryColumns
+) -> tuple[list[torch.Tensor], torch.Tensor, torch.Tensor]:
+    """Return the inputs of a front, its observation, and what the network reads; ``past`` is None in the first step."""
+    if past is None or history.earlier:
+        empty = torch.zeros(len(next(iter(sensed.values()))), len(history.earlier))
+        sensed["past"] = empty if past is None else past
+    given = [sensed[port.name] for port in front.inputs]
+    if past is None and history.earlier:  # a history begins with its first frame repeated
+        sensed["past"] = front(*given)[0][:, history.newest]
+        given = [sensed[port.name] for port in front.inputs]
+    return (given, *front(*given))
+
+
+def _outcomes(errors: np.ndarray, fall: np.ndarray) -> list[Outcome]:
+    """Return the outcomes of S contracts from mean velocity errors (S, C, 3) and times of falls (S, C), s."""
+    sizes = np.linalg.norm(np.array(COMMANDS[1:]), axis=-1)
+    follows = (1.0 - np.linalg.norm(errors[:, 1:], axis=-1) / sizes).mean(axis=1)
+    return [Outcome(float(first), float(share)) for first, share in zip(fall.min(axis=1), follows, strict=True)]
+
+
 def drive(
     config: TrainConfig, specs: Sequence[Spec], network: Network, seconds: float = SECONDS
 ) -> tuple[list[Outcome], dict[str, np.ndarray], np.ndarray]:
@@ -76,13 +97,7 @@ def drive(
         now, parts, observations = readings(core), [], []
         for k, front in enumerate(fronts):
             sensed = {name: values[k * each : (k + 1) * each] for name, values in now.items()}
-            if past is None or history.earlier:
-                sensed["past"] = torch.zeros(each, len(history.earlier)) if past is None else past[k]
-            given = [sensed[port.name] for port in front.inputs]
-            if past is None and history.earlier:
-                sensed["past"] = front(*given)[0][:, history.newest]
-                given = [sensed[port.name] for port in front.inputs]
-            observation, wanted = front(*given)
+            given, observation, wanted = _look(front, sensed, None if past is None else past[k], history)
             observations.append(observation)
             parts.append(wanted)
             if k == 0 and np.isinf(fall[1]):
@@ -105,10 +120,7 @@ def drive(
         velocity = torch.cat([s.base_lin_vel_b[:, :2], s.base_ang_vel_b[:, 2:]], dim=1)
         if step * period >= SETTLE:
             errors.append((velocity - commands).numpy())
-    mean = np.mean(errors, axis=0).reshape(len(specs), each, 3)[:, 1:]
-    follows = 1.0 - np.linalg.norm(mean, axis=-1) / np.linalg.norm(np.array(COMMANDS[1:]), axis=-1)
-    first = fall.reshape(len(specs), each).min(axis=1)
-    outcomes = [Outcome(float(f), float(v)) for f, v in zip(first, follows.mean(axis=1), strict=True)]
+    outcomes = _outcomes(np.mean(errors, axis=0).reshape(len(specs), each, 3), fall.reshape(len(specs), each))
     return outcomes, {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}, rest
 
 

@@ -42,9 +42,9 @@ def audit(recording: Recording) -> AuditReport:
     if not _computable(recording):
         return _report(recording, format_findings, ())
     log = Log(recording)
-    found = impossible(recording)
+    excluded = impossible(recording)
     findings, measured = _run_checks(log)
-    findings = [*found.findings, *findings]
+    findings = [*excluded.findings, *findings]
     off, still = _times(log, ~log.on), _times(log, log.still)
     if off:
         total = sum(b - a for a, b in off)

@@ -67,9 +67,9 @@ def _other_order(log: Log, match: np.ndarray) -> dict[int, int]:
     partner = signals.mixed_up(np.maximum(match, 0.0) * np.exp(-apart))
     if not partner:
         return {}
-    own = list(partner)
-    exchanged = np.mean((target[:, own] - q[:, list(partner.values())]) ** 2)
-    return partner if exchanged < np.mean((target[:, own] + q[:, own]) ** 2) else {}
+    legs = list(partner)
+    exchanged = np.mean((target[:, legs] - q[:, list(partner.values())]) ** 2)
+    return partner if exchanged < np.mean((target[:, legs] + q[:, legs]) ** 2) else {}
 
 
 def _controller_law(log: Log) -> np.ndarray:
