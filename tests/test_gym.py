@@ -154,7 +154,7 @@ def test_an_action_that_is_not_finite_is_refused_by_a_batch_and_leaves_no_file(
     core = make_core(*QUIET, num_envs=3)
     core.reset()
     action = torch.zeros(3, 12)
-    action[1, 0] = torch.inf
+    action[1, 0] = torch.nan
     with pytest.raises(NumericalFault, match=r"^action is not finite in environment 1 at step 1$"):
         core.step(action)
     core.backend.qvel[0, 3] = torch.inf
