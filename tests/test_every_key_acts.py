@@ -643,11 +643,11 @@ class Walk:
             table = ["source=csv", f"path={self.logs(0)}", "options={robot: go2, rate_hz: 100.0}"]
             return [*table, "columns={q_hip: jpos0}"]
         if leaf.program == "record_import" and leaf.key == "drop":
-            table = self._scratch / "spiked.csv"
+            spiked = self._scratch / "spiked.csv"
             moved = np.column_stack([np.arange(200) / 100.0, np.sin(np.arange(200) / 20.0)])
             moved[100, 1] += 1.0
-            np.savetxt(table, moved, delimiter=",", header="t,q", comments="")
-            return ["source=csv", f"path={table}", "options={robot: arm}", "columns={t: t, q_elbow: q}"]
+            np.savetxt(spiked, moved, delimiter=",", header="t,q", comments="")
+            return ["source=csv", f"path={spiked}", "options={robot: arm}", "columns={t: t, q_elbow: q}"]
         if leaf.program == "record_import":
             return ["source=go2_in_air", f"path={self.logs(0)}"]
         if leaf.program == "fit-actuator" and leaf.key == "gains":

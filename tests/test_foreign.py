@@ -14,7 +14,7 @@ from go1exp import robot
 from go1exp.base.paths import data_root
 from go1exp.config.schema.registry import ConfigError
 from go1exp.deploy.export.contract import alternatives, at_rest, build_foreign
-from go1exp.deploy.export.foreign import ORDERS, PRESETS, Back, Front, config_of, spec_of
+from go1exp.deploy.export.foreign import ORDERS, PRESETS, Back, Front, Spec, config_of, spec_of
 from go1exp.deploy.export.foreign_graph import Network, compose_graph
 from go1exp.deploy.export.graph import ExportError
 from go1exp.deploy.runtime.policy import OnnxPolicy
@@ -32,12 +32,12 @@ PLACES |= {"joint_position": 12, "joint_velocity": 24, "previous_action": 36}
 class InTheirs(nn.Module):
     """The shipped network, as another framework would have trained it: its order, scales and units of action."""
 
-    def __init__(self, spec) -> None:  # type: ignore[no-untyped-def]
+    def __init__(self, spec: Spec) -> None:
         super().__init__()
         run = data_root() / "assets/policies/paper"
         config = run_folder.read_parsed(run)
-        self.net, _ = load_network(run, config.ppo, None)
-        self.net = nn.Sequential(self.net.mlp_extractor.policy_net, self.net.action_net)
+        policy, _ = load_network(run, config.ppo, None)
+        self.net = nn.Sequential(policy.mlp_extractor.policy_net, policy.action_net)
         front = Front(spec, config_of(spec)[1])
         inverse = [spec.names.index(name) for name in robot.JOINTS]
         order, gain = [], []
