@@ -195,10 +195,9 @@ def build_foreign(file: Path, given: str, *, force: bool = False) -> tuple[bytes
         lines += at_rest(spec, rest)
         likely = []
         if np.isfinite(stated.fall) or stated.follows < 1 - BETTER:
-            names, others = zip(*alternatives(spec), strict=True)
-            same = [(n, o) for n, o in zip(names, others, strict=True)]
-            outcomes, _, _ = drive(config, [o for _, o in same], network)
-            stands = [(r.follows, n) for r, (n, _) in zip(outcomes, same, strict=True) if np.isinf(r.fall)]
+            others = list(alternatives(spec))
+            outcomes, _, _ = drive(config, [other for _, other in others], network)
+            stands = [(r.follows, n) for r, (n, _) in zip(outcomes, others, strict=True) if np.isinf(r.fall)]
             least = -np.inf if np.isfinite(stated.fall) else stated.follows + BETTER
             likely = [f"{n} (follows {v:.0%})" for v, n in sorted(stands, reverse=True) if v > least][:3]
         model = compose_graph(front, back, network)
