@@ -20,14 +20,13 @@ from go1exp import robot
 from go1exp.base.paths import data_root
 from go1exp.config.schema.registry import ConfigError
 from go1exp.evaluate.controller import forces, gait
-from go1exp.evaluate.controller.adapters import AsTargets
 from go1exp.evaluate.controller.batch import Driven
 from go1exp.evaluate.controller.forces import Body, ForcePlan, Problem
 from go1exp.evaluate.controller.gait import Clock, Feet
 from go1exp.evaluate.controller.mpc import Mpc
 from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
 from go1exp.evaluate.controller.state import Ground, frame
-from go1exp.evaluate.controller.types import Sensed
+from go1exp.evaluate.controller.types import AsTargets, Sensed
 from go1exp.evaluate.rollout import EvalConfig, evaluate
 from go1exp.robot import GRAVITY
 from go1exp.robot.messages import LowCmd

@@ -51,9 +51,9 @@ from go1exp.deploy.runtime.walk import FAULTS, STATUS, Plan
 from go1exp.deploy.sim_robot.__main__ import bundle_task, sim_config
 from go1exp.deploy.sim_robot.machine import NOISE, SILENCE, TICK, Robot, turned
 from go1exp.deploy.sim_robot.server import TRUTH, Network, Truth
-from go1exp.evaluate.controller.adapters import Deployed
 from go1exp.evaluate.controller.mpc import Mpc
 from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
+from go1exp.evaluate.controller.types import Deployed
 from go1exp.gap.robots.go1 import suspended
 from go1exp.logs import recording
 from go1exp.logs.audit import audit

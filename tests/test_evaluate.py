@@ -17,7 +17,7 @@ from torch import Tensor
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError
 from go1exp.evaluate import table
-from go1exp.evaluate.observed import columns
+from go1exp.evaluate.agents import columns
 from go1exp.evaluate.rollout import EvalConfig, evaluate, evaluation_task, grid
 from go1exp.mdp.measures import every_measure
 from go1exp.sim.env.core import Go1Core

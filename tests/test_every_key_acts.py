@@ -1108,7 +1108,7 @@ def list_trace(container: dict[str, Any], walk: Walk) -> Trace:
 def bench_trace(container: dict[str, Any], walk: Walk) -> Trace:
     """What is built and for how long it runs, by a clock of its own and without other processes."""
     from go1exp.cli.bench import APP
-    from go1exp.evaluate.bench import env, measure
+    from go1exp.evaluate.bench import env
     from go1exp.sim.physics import mujoco_cpu
 
     built: list[Any] = []
@@ -1124,10 +1124,10 @@ def bench_trace(container: dict[str, Any], walk: Walk) -> Trace:
         return 0.0
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(measure, "time", types.SimpleNamespace(perf_counter=lambda: 0.04 * next(ticks)))
+        patch.setattr(env, "time", types.SimpleNamespace(perf_counter=lambda: 0.04 * next(ticks)))
         patch.setattr(mujoco_cpu, "Batch", batch)
         patch.setattr(env, "Batch", batch)
-        patch.setattr(env, "subproc_subject", lambda task: (measure.Subject("processes", lambda: 1), lambda: None))
+        patch.setattr(env, "subproc_subject", lambda task: (env.Subject("processes", lambda: 1), lambda: None))
         patch.setattr(env, "memory_per_env_kb", memory)
         said, files = outcome(APP, container, walk)
     yield "built", built

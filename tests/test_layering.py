@@ -46,7 +46,7 @@ ORDER = {
     ),
     "deploy": ("estimation", "runtime", "__main__.py", "export", "sim_robot"),
     "evaluate": (
-        *("statistics", "quantities.py", "rows.py", "observed.py", "controller", "recorder.py", "agents.py"),
+        *("statistics", "quantities.py", "controller", "recorder.py", "agents.py"),
         *("rollout.py", "footfalls.py", "video.py", "stick.py", "criteria.py", "table.py", "asynchronous.py"),
         *("protocol", "report", "bench", "viewer"),
     ),

@@ -10,7 +10,6 @@ from scipy import stats
 
 from go1exp.evaluate.protocol.claims import Claim, evaluated, verdict
 from go1exp.evaluate.quantities import FELL, FINGERPRINT, MOVING, Column, distinct, summary
-from go1exp.evaluate.statistics.compare import verdict_by_interval
 from go1exp.evaluate.statistics.intervals import (
     Interval,
     bootstrap_interval,
@@ -20,6 +19,7 @@ from go1exp.evaluate.statistics.intervals import (
     pairs_needed,
     rate_interval,
 )
+from go1exp.evaluate.statistics.runs import verdict_by_interval
 
 MOST = Claim(quantity="error", at_most=1.0, tolerance=0.2, source="here")
 LEAST = Claim(quantity="error", at_least=1.0, tolerance=0.2, source="here")

@@ -15,9 +15,16 @@ from go1exp.config.compose import compose
 from go1exp.evaluate.protocol import comparing
 from go1exp.evaluate.protocol.base import Played, chosen
 from go1exp.evaluate.protocol.claims import evaluated
+from go1exp.evaluate.protocol.pages import (
+    ACROSS,
+    claims_table,
+    comparison,
+    condition_text,
+    figure_tables,
+    meanings,
+    page,
+)
 from go1exp.evaluate.protocol.playing import Result, summarised
-from go1exp.evaluate.protocol.report.pages import comparison, page
-from go1exp.evaluate.protocol.report.tables import ACROSS, claims_table, condition_text, figure_tables, meanings
 from tests.phone import PHONE, needs_chromium, on_a_phone
 
 

@@ -25,9 +25,9 @@ from go1exp.evaluate.protocol import comparing
 from go1exp.evaluate.protocol.base import Chosen, chosen
 from go1exp.evaluate.protocol.kinds.corners import step_answer
 from go1exp.evaluate.protocol.kinds.push_map import largest_survived
+from go1exp.evaluate.protocol.pages import comparison, write
 from go1exp.evaluate.protocol.plan import Impulses, Plan
 from go1exp.evaluate.protocol.playing import Rates, Result, play
-from go1exp.evaluate.protocol.report.pages import comparison, write
 from go1exp.evaluate.protocol.stage import Setting, Stage, fitting_step
 from go1exp.evaluate.quantities import FINGERPRINT, ROBOT
 from go1exp.sim.task import TaskConfig

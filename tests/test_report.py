@@ -20,14 +20,14 @@ from go1exp.cli.report import _task
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError
 from go1exp.config.schema.settings import parse
+from go1exp.evaluate.quantities import rows_of
+from go1exp.evaluate.quantities import write as write_evaluation
 from go1exp.evaluate.report import curves
-from go1exp.evaluate.report.made import Report, report
+from go1exp.evaluate.report.results import Report, report
 from go1exp.evaluate.report.settings import ReportSettings
 from go1exp.evaluate.report.study import baseline, groups, study
 from go1exp.evaluate.report.tables import plain_rows, tables
 from go1exp.evaluate.report.writing import page, write
-from go1exp.evaluate.rows import rows_of
-from go1exp.evaluate.rows import write as write_evaluation
 from tests.phone import PHONE, needs_chromium, on_a_phone
 
 CONFIG: dict[str, Any] = {
@@ -295,7 +295,7 @@ def test_without_anything_random_there_are_no_robots_to_pair(tmp_path: Path) -> 
 
 def kicked(folder: Path, evaluated: bool = False) -> None:
     """Write two groups of six runs that were kicked; with a larger weight they recover sooner."""
-    from go1exp.evaluate.rows import write_rows
+    from go1exp.evaluate.quantities import write_rows
 
     protocol = compose("eval", ["protocol=kicks"])["protocol"]["kicks"]
     for seed in range(6):

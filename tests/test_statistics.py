@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import go1exp.evaluate.statistics.runs as compare
 from go1exp.base.paths import data_root
-from go1exp.evaluate.statistics import association, compare
+from go1exp.evaluate.statistics import association
 from go1exp.evaluate.statistics.intervals import (
     Interval,
     bootstrap_interval,

@@ -85,14 +85,13 @@ def _task(container: dict[str, Any]) -> None:
     container = compose("train", overrides)
     config = parse_train(container)
 
-    from go1exp.evaluate.bench import env, train
-    from go1exp.evaluate.bench.measure import machine
+    from go1exp.evaluate.bench import env
 
     timing = (settings.num_envs, settings.rounds, settings.seconds, show)
     if settings.suite == "env":
         figures = env.run(config.task, overrides, *timing)
     elif settings.suite == "train":
-        figures = train.run(config, *timing)
+        figures = env.train(config, *timing)
     elif settings.suite == "deploy":
         from go1exp.evaluate.bench import deploy
 
@@ -108,7 +107,7 @@ def _task(container: dict[str, Any]) -> None:
     else:
         figures = _actuator(config.task, timing)
     about = " ".join(settings.overrides) or "defaults"
-    print(f"suite={settings.suite} N={settings.num_envs} ({about})\n{machine()}\n")
+    print(f"suite={settings.suite} N={settings.num_envs} ({about})\n{env.machine()}\n")
     for name, value in figures.items():
         goal, meaning = GOALS.get(name, (None, name.replace("_per_s", " per second").replace("_", " ")))
         aim = "" if goal is None else f"goal {goal:g}"
@@ -134,11 +133,11 @@ def _actuator(task: TaskConfig, timing: tuple[Any, ...]) -> dict[str, float]:
 def _mpc(task: TaskConfig, timing: tuple[Any, ...]) -> dict[str, float]:
     """Run the suite of the model predictive controller, with its own settings."""
     from go1exp.cli import subjects
-    from go1exp.evaluate.bench import mpc
+    from go1exp.evaluate.bench import deploy
 
     settings = subjects.chosen_controller(compose("record")["controller"])
     assert settings is not None
-    return mpc.run(task, settings, *timing[1:])
+    return deploy.run_mpc(task, settings, *timing[1:])
 
 
 def _gpu(config: TrainConfig, overrides: list[str], timing: tuple[Any, ...]) -> dict[str, float]:

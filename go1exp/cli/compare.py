@@ -83,9 +83,9 @@ def _with(protocols: list[Chosen], trunk_velocity: Any) -> list[Chosen]:
 def _report(plays: dict[str, list[Result]], folder: Path, about: dict[str, Any]) -> None:
     """Write page, JSON and rows, and print the verdicts."""
     from go1exp.evaluate.protocol import comparing
+    from go1exp.evaluate.protocol.pages import comparison
     from go1exp.evaluate.protocol.playing import as_json
-    from go1exp.evaluate.protocol.report.pages import comparison
-    from go1exp.evaluate.rows import finite, write_rows
+    from go1exp.evaluate.quantities import finite, write_rows
 
     differences = {
         key: [d for r in results[1:] for d in comparing.compared(results[0], r)] for key, results in plays.items()
@@ -108,7 +108,7 @@ def _report(plays: dict[str, list[Result]], folder: Path, about: dict[str, Any])
 def lines(differences: dict[str, Any]) -> list[str]:
     """Return the lines for a terminal: significant differences, and the number of the others."""
     from go1exp.base.report.table import interval_text
-    from go1exp.evaluate.protocol.report.tables import condition_text
+    from go1exp.evaluate.protocol.pages import condition_text
 
     text_lines = []
     for key, those in differences.items():

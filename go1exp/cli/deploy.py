@@ -174,8 +174,8 @@ def _mover(controller: MpcSettings | None) -> Mover | None:
     """Return what commands the robot in place of the bundle's policy, if anything does."""
     if controller is None:
         return None
-    from go1exp.evaluate.controller.adapters import Deployed
     from go1exp.evaluate.controller.mpc import Mpc
+    from go1exp.evaluate.controller.types import Deployed
 
     return Deployed(Mpc(controller))
 

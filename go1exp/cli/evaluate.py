@@ -201,9 +201,9 @@ def play_protocols(
     protocols: Sequence[Chosen], subject: Named, folder: Path, other: dict[str, Any], rates: Rates
 ) -> None:
     """Play protocols one after the other, write what came of each, and print the verdicts."""
+    from go1exp.evaluate.protocol.pages import write
     from go1exp.evaluate.protocol.playing import play as played
     from go1exp.evaluate.protocol.playing import refuse_lengths
-    from go1exp.evaluate.protocol.report.pages import write
 
     drives = agent(subject, other)
     refuse(protocols, drives)
@@ -223,7 +223,7 @@ def result_lines(result: Result) -> list[str]:
     """Return what a terminal shows of a result."""
     from go1exp.base.report.table import interval_text
     from go1exp.evaluate.protocol.claims import limits
-    from go1exp.evaluate.protocol.report.tables import condition_text, falls
+    from go1exp.evaluate.protocol.pages import condition_text, falls
 
     text_lines = [f"{result.chosen.key}: {result.label}, {result.seconds:.0f} s; {falls(result)}"]
     for v in result.verdicts:
@@ -316,7 +316,8 @@ def _grid(
     """Play the grid of constant commands."""
     announce("evaluating")
     show = spinner(1, "evaluating")
-    from go1exp.evaluate import criteria, rows, table
+    from go1exp.evaluate import criteria, table
+    from go1exp.evaluate.quantities import write as write_report
     from go1exp.evaluate.rollout import EvalConfig, delay_margin, evaluate, grid
     from go1exp.train.policy import load_run
 
@@ -340,7 +341,7 @@ def _grid(
         falls = report["distinct_falls"]
         report["delay_margin"] = delay_margin(task, policy, config, falls, spinner(1, "with a delay"), make)
     report["criteria"] = [dataclasses.asdict(verdict) for verdict in criteria.evaluated(report)]
-    rows.write(report, out)
+    write_report(report, out)
     print(table.text(report))
     print(f"\nwritten to {out}")
 

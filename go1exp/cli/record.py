@@ -210,8 +210,8 @@ def _misfits(settings: RecordSettings, parts: dict[str, Any]) -> list[str]:
 def _record_mpc(rig: Rig, controller: MpcSettings, settings: RecordSettings) -> list[Recording]:
     """Let a model predictive controller walk simulated robots by targets alone; return a recording of each."""
     from go1exp.cli import subjects
-    from go1exp.evaluate.controller.adapters import AsTargets
     from go1exp.evaluate.controller.batch import Driven
+    from go1exp.evaluate.controller.types import AsTargets
     from go1exp.logs.record import simulate
     from go1exp.sim.task import parse_train
 

@@ -14,7 +14,7 @@ from go1exp.evaluate.report.settings import ReportSettings
 
 if TYPE_CHECKING:
     from go1exp.evaluate.protocol.base import Chosen
-    from go1exp.evaluate.report.made import Report
+    from go1exp.evaluate.report.results import Report
     from go1exp.evaluate.report.study import Study
 
 
@@ -31,7 +31,7 @@ def _task(container: dict[str, Any]) -> None:
     runs = study(settings.folders, settings.unfinished)
     if settings.eval:
         _evaluate(runs, settings, protocols)
-    from go1exp.evaluate.report.made import report
+    from go1exp.evaluate.report.results import report
     from go1exp.evaluate.report.writing import write
 
     made = report(runs, settings, dataclasses.asdict(settings))

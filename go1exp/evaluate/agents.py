@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from go1exp.config.schema.history import history_columns
+from go1exp.config.schema.history import frame_width, history_columns, width
 from go1exp.config.schema.registry import ConfigError
 from go1exp.deploy.estimation import Filters
 from go1exp.deploy.export.build import readings
@@ -20,8 +20,7 @@ from go1exp.deploy.runtime.bundle import Bundle
 from go1exp.deploy.runtime.policy import Past, PolicyMemory
 from go1exp.deploy.sim_robot.machine import noisy
 from go1exp.evaluate.controller.batch import Driven
-from go1exp.evaluate.controller.types import Controller
-from go1exp.evaluate.observed import TrunkVelocity, columns
+from go1exp.evaluate.controller.types import Controller, TrunkVelocity
 from go1exp.logs.record.tape import sample
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TaskConfig
@@ -72,6 +71,16 @@ class Agent(Protocol):
 
 
 TERM = "base_linear_velocity"
+
+
+def columns(task: TaskConfig, term: str) -> slice | None:
+    """Return the columns of a term's newest values in the observation; None if the policy does not observe it."""
+    start = 0
+    for t in task.observation:
+        if t.entry.name == term:
+            return slice(start, start + frame_width(t))
+        start += width(t)
+    return None
 
 
 class VelocityFilters:

@@ -15,11 +15,9 @@ from go1exp.base.wording import counted
 from go1exp.config.schema.physics import BackendConfig, CpuBackend
 from go1exp.config.schema.registry import ConfigError, Term, TooLongError, members
 from go1exp.evaluate.agents import Agent, ControllerAgent, PolicyAgent
-from go1exp.evaluate.controller.types import Controller
-from go1exp.evaluate.observed import TrunkVelocity
-from go1exp.evaluate.quantities import described, share
+from go1exp.evaluate.controller.types import Controller, TrunkVelocity
+from go1exp.evaluate.quantities import described, drawn, rows_of, share
 from go1exp.evaluate.recorder import Recorder, bytes_per_second
-from go1exp.evaluate.rows import drawn, rows_of
 from go1exp.mdp.commands import FixedVelocity
 from go1exp.mdp.measures import measured
 from go1exp.sim.env.core import Go1Core

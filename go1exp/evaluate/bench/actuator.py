@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from go1exp.config.schema.registry import Term, members
-from go1exp.evaluate.bench.env import core_subject
-from go1exp.evaluate.bench.measure import rates, ratio
+from go1exp.evaluate.bench.env import core_subject, rates, ratio
 from go1exp.gap.actuator_net.fitting import fit
 from go1exp.gap.actuator_net.settings import FitSettings
 from go1exp.logs import recording

@@ -1,4 +1,4 @@
-"""``suite=deploy``: timing of the runtime on this machine, and of an empty loop for comparison.
+"""``suite=deploy`` and ``suite=mpc``: timing of the runtime and of ``controller=mpc`` on this machine.
 
 The runtime is ``python -m go1exp.deploy`` in a process of its own, as on the robot's computer, with a network of the
 size of training, against the simulated robot in another process. The policy is hardly trained: it stands.
@@ -6,6 +6,7 @@ size of training, against the simulated robot in another process. The policy is 
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from go1exp.deploy.export.build import build
 from go1exp.deploy.runtime.bundle import Bundle, loads
@@ -32,9 +34,14 @@ from go1exp.deploy.runtime.go1_wire import (
 from go1exp.deploy.runtime.launch import RobotError, SimulatedRobot
 from go1exp.deploy.runtime.loop import Timing
 from go1exp.deploy.runtime.loop import run as loop
+from go1exp.evaluate.controller.batch import Driven
+from go1exp.evaluate.controller.mpc import Mpc
+from go1exp.evaluate.controller.settings import MpcSettings
+from go1exp.evaluate.controller.types import Command, Sensed
 from go1exp.robot.go1_fields import JOINTS
 from go1exp.robot.messages import LowCmd, LowState
-from go1exp.sim.task import parse_train
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.task import TaskConfig, parse_train
 from go1exp.train import run_folder, trainer
 
 RATE = 400.0
@@ -148,3 +155,50 @@ def _walk(file: Path, seconds: float, out: Path) -> dict[str, float]:
         "start_s": account["first_command_after_s"],
         "memory_mb": account["memory_mb"],
     }
+
+
+COMMANDS = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 1.0))
+"""Commands of the robots, one each: x, y in m/s, yaw rate in rad/s."""
+
+
+class _Timed:
+    """A controller whose calls are timed."""
+
+    def __init__(self, inner: Mpc, times: list[float]) -> None:
+        self.inner, self.period, self._times = inner, inner.period, times
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self.inner.reset()
+
+    def step(self, command: Command, sensed: Sensed) -> LowCmd:
+        """Act, and note the time that it took."""
+        start = time.perf_counter()
+        drive = self.inner.step(command, sensed)
+        self._times.append(time.perf_counter() - start)
+        return drive
+
+
+def run_mpc(
+    task: TaskConfig, settings: MpcSettings, rounds: int, seconds: float, on_round: Callable[[int, int], None]
+) -> dict[str, float]:
+    """Walk ``seconds`` of simulated time in each round; return medians over the rounds of percentiles, ms."""
+    task = dataclasses.replace(task, rand=(), event=())
+    results = []
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        for k in range(rounds):
+            times: list[float] = []
+            core = Go1Core(task, len(COMMANDS), k, noise=False, imu=True)
+            driven = Driven(core, lambda times=times: _Timed(Mpc(settings), times), noise=True, seed=k)  # type: ignore[misc]
+            observation = core.reset()
+            for _ in range(max(round(seconds / core.task.sim.policy_dt), 1)):
+                core.command.value.copy_(torch.tensor(COMMANDS))
+                observation = core.step(driven(observation)).observation
+            results.append(1e3 * np.percentile(times, [50, 99]))
+            on_round(k + 1, rounds)
+    finally:
+        torch.set_num_threads(threads)
+    p50, p99 = np.median(results, axis=0)
+    return {"mpc_p50_ms": float(p50), "mpc_p99_ms": float(p99)}

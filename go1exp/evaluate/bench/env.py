@@ -1,13 +1,22 @@
-"""``suite=env``: speed of the environment relative to bare MuJoCo, and memory per environment."""
+"""``suite=env`` and ``suite=train``: speed of the environment relative to bare MuJoCo, memory, training.
+
+Timing is robust on a busy machine: subjects run in turns, and the median of the rounds counts.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import os
+import platform
 import resource
+import statistics
 import subprocess
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +26,56 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from go1exp import robot
 from go1exp.config.schema.joint_values import spread
-from go1exp.evaluate.bench.measure import Subject, rates, ratio
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.gym_env import Go1Env
 from go1exp.sim.physics.scene import build_model
-from go1exp.sim.task import TaskConfig
+from go1exp.sim.task import TaskConfig, TrainConfig
 from go1exp.sim.terrain import build_terrain
+from go1exp.train import trainer
+from go1exp.train.ppo import AdaptivePPO
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A piece of work to measure: ``work()`` does one unit and returns its number of environment steps."""
+
+    label: str
+    work: Callable[[], int]
+
+
+def rates(
+    subjects: Mapping[str, Subject], rounds: int, seconds: float, on_round: Callable[[int, int], None]
+) -> dict[str, list[float]]:
+    """Return the steps per second of each subject in each round; a warm-up unit of each does not count."""
+    for subject in subjects.values():
+        subject.work()
+    measured: dict[str, list[float]] = {name: [] for name in subjects}
+    for k in range(rounds):
+        for name, subject in subjects.items():
+            steps, start = 0, time.perf_counter()
+            # Whole units only: the time is taken after the last one.
+            while (elapsed := time.perf_counter() - start) < seconds:
+                steps += subject.work()
+            measured[name].append(steps / elapsed)
+        on_round(k + 1, rounds)
+    return measured
+
+
+def ratio(rates: Mapping[str, list[float]], over: str, under: str) -> float:
+    """Return the median over rounds of one subject's rate over another's, taken within each round."""
+    return statistics.median(a / b for a, b in zip(rates[over], rates[under], strict=True))
+
+
+def machine() -> str:
+    """Describe the machine and the versions that matter, one line."""
+    cpu = platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        cpu = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        pass
+    return f"{cpu}, {os.cpu_count()} cores, mujoco {version('mujoco-core')}, torch {torch.__version__}"
+
 
 ACTION_SCALE = 0.5
 """Standard deviation of the random actions, policy units (chosen: robots move their feet and few fall)."""
@@ -145,4 +198,33 @@ def run(
         "env_over_bare": ratio(measured, "env", "bare"),
         "env_over_subproc": ratio(measured, "env", "subproc"),
         "memory_per_env_kb": memory_per_env_kb(overrides),
+    }
+
+
+def learning(ppo: AdaptivePPO, config: TrainConfig, label: str, finish: Callable[[], None] = lambda: None) -> Subject:
+    """Whole iterations: rollout, advantages, update; ``finish`` waits for the device."""
+    size = config.ppo.num_envs * config.ppo.steps
+
+    def work() -> int:
+        ppo.learn(size, reset_num_timesteps=ppo.iteration == 0)
+        finish()
+        return size
+
+    return Subject(label, work)
+
+
+def train(
+    config: TrainConfig, num_envs: int, rounds: int, seconds: float, on_round: Callable[[int, int], None]
+) -> dict[str, float]:
+    """Measure; return the figures by name."""
+    config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, num_envs=num_envs))
+    subjects = {
+        "train": learning(trainer.build(config), config, "training"),
+        "env": core_subject(config.task, num_envs),
+    }
+    measured = rates(subjects, rounds, seconds, on_round)
+    return {
+        "train_steps_per_s": float(np.median(measured["train"])),
+        "env_steps_per_s": float(np.median(measured["env"])),
+        "train_over_env": ratio(measured, "train", "env"),
     }

@@ -17,9 +17,7 @@ import torch
 from go1exp import robot
 from go1exp.config.schema.joint_values import spread
 from go1exp.config.schema.registry import ConfigError, Term, members
-from go1exp.evaluate.bench.env import ACTION_SCALE
-from go1exp.evaluate.bench.measure import Subject, rates, ratio
-from go1exp.evaluate.bench.train import learning
+from go1exp.evaluate.bench.env import ACTION_SCALE, Subject, learning, rates, ratio
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.engine import make_backend
 from go1exp.sim.env.sb3_env import Go1VecEnv

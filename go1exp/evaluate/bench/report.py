@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from go1exp.evaluate.rows import FILE, rows_of, write
+from go1exp.evaluate.quantities import FILE, rows_of, write
 
 RUNS, SEEDS, ROWS, COLUMNS = 100, 5, 5000, 60
 """Runs, runs of each configuration, and rows and columns of each run's metrics."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from go1exp.base.tensors.rotation import rotate_inverse
 from go1exp.config.schema.registry import ConfigError
 from go1exp.deploy.estimation import Filters
 from go1exp.deploy.sim_robot.machine import noisy
-from go1exp.evaluate.controller.types import Command, Controller, Savable, Sensed
+from go1exp.evaluate.controller.types import Command, Controller, Savable, Sensed, TrunkVelocity
 from go1exp.logs.record.tape import sample
 from go1exp.robot.messages import LowCmd
 from go1exp.sim.env.core import Go1Core
@@ -42,7 +42,7 @@ class Driven:
         *,
         noise: bool,
         seed: int,
-        trunk_velocity: Literal["exact", "estimated"] = "exact",
+        trunk_velocity: TrunkVelocity = "exact",
     ) -> None:
         """Control the robots of ``core``, which must have been built with ``imu=True``.
 

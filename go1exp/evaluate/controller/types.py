@@ -1,16 +1,20 @@
-"""Interface of a controller of one robot."""
+"""Interface of a controller of one robot, and its adapters to other interfaces."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
-from go1exp.robot.messages import LowCmd
+from go1exp.robot.messages import LowCmd, LowState
 
 Command = tuple[float, float, float]
 """Commanded velocity of the trunk: x, y in m/s, yaw rate in rad/s, trunk frame."""
+
+
+TrunkVelocity = Literal["exact", "estimated"]
+"""Velocity of the trunk that is observed: the true one, or what the filter makes of the sensors."""
 
 
 @dataclass(frozen=True)
@@ -59,3 +63,45 @@ class Savable(Protocol):
 
     def load(self, state: Any) -> None:
         """Restore what ``save`` returned."""
+
+
+class AsTargets:
+    """Converts a controller's commands to position targets at fixed gains, with the same torque at its ticks.
+
+    With the actuator's gains kp and kd, the target is q + (torque + kd qd) / kp. Between two ticks the actuator's gains
+    act, not the controller's. Recordings of such a walk are complete: the targets determine the motion.
+
+    Attributes:
+        period: time between two calls, s.
+    """
+
+    def __init__(self, inner: Controller, kp: np.ndarray, kd: np.ndarray) -> None:
+        """Wrap ``inner`` for an actuator with gains (12,), N m/rad, positive, and N m s/rad."""
+        self.period = inner.period
+        self._inner, self._kp, self._kd = inner, np.asarray(kp, dtype=float), np.asarray(kd, dtype=float)
+
+    def reset(self) -> None:
+        """Reset the controller."""
+        self._inner.reset()
+
+    def step(self, command: Command, sensed: Sensed) -> LowCmd:
+        """Return targets at the actuator's gains, without feed-forward torque."""
+        inner, q, qd = self._inner.step(command, sensed), sensed.joint_pos, sensed.joint_vel
+        torque = inner.kp * (inner.joint_target - q) - inner.kd * qd
+        if inner.feedforward is not None:
+            torque = torque + inner.feedforward
+        return LowCmd(q + (torque + self._kd * qd) / self._kp, self._kp, self._kd)
+
+
+class Deployed:
+    """A controller in the runtime's loop, which must run at its rate, in place of a bundle's policy."""
+
+    def __init__(self, controller: Controller) -> None:
+        """Walk by ``controller``."""
+        self._controller = controller
+
+    def step(self, velocity: np.ndarray, state: LowState, base_lin_vel: np.ndarray) -> LowCmd:
+        """Return the command of a cycle; arguments as those of ``go1exp.deploy.runtime.controller.Mover``."""
+        x, y, yaw = velocity.tolist()
+        readings = state.joint_pos, state.joint_vel, state.imu_quat, state.imu_gyro, base_lin_vel, state.foot_force
+        return self._controller.step((x, y, yaw), Sensed(*readings))

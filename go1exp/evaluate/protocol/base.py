@@ -23,7 +23,7 @@ from go1exp.config.schema.registry import (
     within,
 )
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.observed import TrunkVelocity
+from go1exp.evaluate.controller.types import TrunkVelocity
 from go1exp.evaluate.protocol.claims import Claim
 from go1exp.evaluate.quantities import FINGERPRINT, LIFE, Column, Derived, Row
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from go1exp.evaluate.protocol.playing import Result
 from go1exp.evaluate.quantities import ROBOT, Column, Derived, Row, about, by_condition, plain, values
-from go1exp.evaluate.statistics.compare import Word, verdict_by_interval
 from go1exp.evaluate.statistics.intervals import (
     Interval,
     bootstrap_interval,
@@ -20,6 +19,7 @@ from go1exp.evaluate.statistics.intervals import (
     paired_share_interval,
     pairs_needed,
 )
+from go1exp.evaluate.statistics.runs import Word, verdict_by_interval
 
 DRAWS = 200
 """Bootstrap samples of the difference of a figure of all robots."""

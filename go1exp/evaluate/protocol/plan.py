@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from go1exp.base.tensors.rotation import rotate_inverse
-from go1exp.evaluate.observed import TrunkVelocity
+from go1exp.evaluate.controller.types import TrunkVelocity
 from go1exp.mdp.kinematics import KinematicState
 from go1exp.mdp.measures.trace import Trace
 from go1exp.sim.terrain import TerrainConfig

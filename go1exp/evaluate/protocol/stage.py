@@ -16,7 +16,7 @@ from torch import Tensor
 from go1exp.config.schema.physics import BackendConfig
 from go1exp.config.schema.registry import Entry, Term, members
 from go1exp.evaluate.agents import Agent, Progress
-from go1exp.evaluate.observed import TrunkVelocity
+from go1exp.evaluate.controller.types import TrunkVelocity
 from go1exp.evaluate.protocol.plan import STEP_BYTES, Array, Impulses, Kicker, Motion, Plan, heading
 from go1exp.evaluate.recorder import Recorder, bytes_per_step
 from go1exp.evaluate.rollout import DELAY, EvalConfig, delayed, evaluation_task, require_agreement

@@ -11,13 +11,13 @@ from typing import Any
 from go1exp.config.schema.registry import TooLongError, bind_list
 from go1exp.evaluate.agents import PolicyAgent
 from go1exp.evaluate.protocol.base import Chosen
+from go1exp.evaluate.protocol.pages import write as write_protocol
 from go1exp.evaluate.protocol.playing import Rates, play
-from go1exp.evaluate.protocol.report.pages import write as write_protocol
+from go1exp.evaluate.quantities import FILE, write
 from go1exp.evaluate.report.evaluations import GRID, PROTOCOLS, names
 from go1exp.evaluate.report.settings import EvaluationSettings
 from go1exp.evaluate.report.study import Run
 from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
-from go1exp.evaluate.rows import FILE, write
 from go1exp.train.policy import load_run
 
 BEST = "best.pt"

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from go1exp import robot
 from go1exp.config.schema.registry import ConfigError, unknown_name
-from go1exp.evaluate.quantities import FELL, MOVING, ROBOT, Column, columns_of
+from go1exp.evaluate.quantities import COLUMNS, DRAW, FELL, FILE, KEYS, MOVING, ROBOT, Column, columns_of, rows_file
 from go1exp.evaluate.report.study import Run, Study
-from go1exp.evaluate.rows import COLUMNS, DRAW, FILE, KEYS, rows_file
 from go1exp.mdp.measures import every_measure
 
 if TYPE_CHECKING:

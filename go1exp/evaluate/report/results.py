@@ -1,4 +1,4 @@
-"""Quantities of groups with intervals over runs, comparisons with the baseline, and correlates of error and falls."""
+"""A report as data: quantities with intervals over runs, comparisons with the baseline, correlates."""
 
 from __future__ import annotations
 
@@ -12,12 +12,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from go1exp.evaluate.quantities import ROBOT, Column
-from go1exp.evaluate.report.evaluations import Evaluation, RunRows, draws
-from go1exp.evaluate.report.study import Group
-from go1exp.evaluate.statistics import compare
+from go1exp.evaluate.report import curves as learning
+from go1exp.evaluate.report.curves import Curve
+from go1exp.evaluate.report.evaluations import Evaluation, RunRows, check_figures, draws, evaluations
+from go1exp.evaluate.report.settings import ReportSettings
+from go1exp.evaluate.report.study import Group, Study, baseline, groups
 from go1exp.evaluate.statistics.association import Association, associations
 from go1exp.evaluate.statistics.intervals import Interval, stratified_mean_interval
-from go1exp.evaluate.statistics.runs import clustered_share, iqm_interval, pooled_share, share_bootstrap
+from go1exp.evaluate.statistics.runs import (
+    ALPHA,
+    ORDER,
+    Difference,
+    Word,
+    clustered_share,
+    difference,
+    holm,
+    iqm_interval,
+    pooled_share,
+    runs_for_significance,
+    runs_needed,
+    share_bootstrap,
+    verdict_by_p,
+)
 
 Floats = NDArray[np.float64]
 Rows = Mapping[Path, NDArray[np.bool_]]
@@ -68,9 +84,9 @@ class Verdict:
     column: Column
     first: float
     other: float
-    difference: compare.Difference
+    difference: Difference
     adjusted_p: float
-    word: compare.Word
+    word: Word
     needed: int | None
     hopeless: bool
     robots: Interval | None
@@ -173,19 +189,19 @@ def compared(
         return []
     subjects = [(g, c) for c in columns for g in evaluated if g is not baseline]
     samples = [_samples(evaluation, group, baseline, column, paired) for group, column in subjects]
-    differences = [compare.difference(a, b, paired) for a, b in samples]
+    differences = [difference(a, b, paired) for a, b in samples]
     p_values = [d.p for d in differences]
-    adjusted = compare.holm(p_values) if correction == "holm" else p_values
+    adjusted = holm(p_values) if correction == "holm" else p_values
     family = sum(math.isfinite(p) for p in p_values) if correction == "holm" else 1
     entries = []
     for (group, column), (a, b), d, p in zip(subjects, samples, differences, adjusted, strict=True):
         assert column.better is not None
-        word, needed = compare.verdict_by_p(d.estimate.estimate, p, column.better), None
-        if word == compare.ORDER[-1]:
-            level = compare.ALPHA / max(family, 1)
-            needed = compare.runs_needed(a[np.isfinite(a)], b[np.isfinite(b)], alpha=level)
+        word, needed = verdict_by_p(d.estimate.estimate, p, column.better), None
+        if word == ORDER[-1]:
+            level = ALPHA / max(family, 1)
+            needed = runs_needed(a[np.isfinite(a)], b[np.isfinite(b)], alpha=level)
         first, other = (float(iqm_interval(v).estimate) for v in (b, a))
-        hopeless = not d.least_p * family <= compare.ALPHA
+        hopeless = not d.least_p * family <= ALPHA
         robots = _by_robot(evaluation, group, baseline, column)
         entries.append(Verdict(group.name, column, first, other, d, p, word, needed, hopeless, robots))
     return entries
@@ -249,7 +265,7 @@ def sensitivities(evaluation: Evaluation, made: Sequence[Group]) -> list[Sensiti
 
 
 def _corrected(source: Literal["setting", "drawn"], column: Column, those: Sequence[Association]) -> list[Sensitivity]:
-    adjusted = compare.holm([a.p for a in those])
+    adjusted = holm([a.p for a in those])
     return [Sensitivity(source, column, a, p) for a, p in zip(those, adjusted, strict=True)]
 
 
@@ -301,3 +317,74 @@ def _deviation(rows: RunRows, keys: Sequence[str], column: Column) -> Floats:
     counts = np.maximum(np.bincount(which[known], minlength=which.max() + 1), 1)
     centres = np.bincount(which[known], values[known], minlength=which.max() + 1) / counts
     return np.asarray(values - centres[which])
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Results of one evaluation of all runs.
+
+    Attributes:
+        evaluation: of all runs.
+        figures: quantities over all conditions.
+        by_condition: quantities of each condition.
+        verdicts: comparisons with the baseline; none for a single group.
+        runs_required: least number of runs per group with which a difference can be significant; None for none.
+        sensitivities: correlates of the main quantities.
+    """
+
+    evaluation: Evaluation
+    figures: list[Figure]
+    by_condition: list[Figure]
+    verdicts: list[Verdict]
+    runs_required: int | None
+    sensitivities: list[Sensitivity]
+
+
+@dataclass(frozen=True)
+class Report:
+    """Content of a report.
+
+    Attributes:
+        study: included and excluded runs.
+        groups: of the included runs.
+        baseline: one of the groups.
+        curves: of metrics.
+        outcomes: of evaluations.
+        settings: as requested, plain data.
+    """
+
+    study: Study
+    groups: list[Group]
+    baseline: Group
+    curves: list[Curve]
+    outcomes: list[Outcome]
+    settings: dict[str, Any]
+
+
+def report(study: Study, settings: ReportSettings, plain: dict[str, Any]) -> Report:
+    """Make the report of a study.
+
+    Raises:
+        ConfigError: if the requested baseline or quantity does not exist.
+    """
+    made = groups(study)
+    first = baseline(made, settings.baseline)
+    metrics = {}
+    for run in (run for group in made for run in group.runs):
+        metrics[run.folder], remark = learning.read(run.folder, settings.curves)
+        study.notes += [remark] if remark else []
+    drawn, notes = learning.curves(made, metrics, settings.curves, settings.points)
+    study.notes += notes
+    outcomes = []
+    evaluated = evaluations(study)
+    check_figures(settings.figures or (), evaluated)
+    for each in evaluated:
+        given = (settings.figures, settings.correction, settings.paired)
+        verdicts = compared(each, made, first, *given) if len(made) > 1 else []
+        if not any(run.folder in each.runs for run in first.runs):
+            study.notes.append(f"{each.name}: the baseline has none, so that nothing is compared with it")
+        together = max(len(verdicts), 1) if settings.correction == "holm" else 1
+        runs_required = runs_for_significance(settings.paired, together)
+        conditions, correlates = by_condition(each, made), sensitivities(each, made)
+        outcomes.append(Outcome(each, figures(each, made), conditions, verdicts, runs_required, correlates))
+    return Report(study, made, first, drawn, outcomes, plain)

@@ -7,12 +7,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from go1exp.base.report.table import NOTHING, Cell, Table, interval_text, number, spread, verdict
-from go1exp.evaluate.protocol.report.tables import condition_text
-from go1exp.evaluate.report.drawings import SOURCES, label
-from go1exp.evaluate.report.made import Outcome, Report
-from go1exp.evaluate.report.results import Figure, Verdict
-from go1exp.evaluate.statistics.compare import ORDER, RESAMPLES
+from go1exp.evaluate.protocol.pages import condition_text
+from go1exp.evaluate.quantities import Column
+from go1exp.evaluate.report.results import Figure, Outcome, Report, Verdict
 from go1exp.evaluate.statistics.intervals import Interval
+from go1exp.evaluate.statistics.runs import ORDER, RESAMPLES
 
 PlainRow = dict[str, Any]
 
@@ -39,6 +38,14 @@ MOST_KEYS = 5
 
 MOST_COLUMNS = 6
 """Columns of the table of quantities."""
+
+SOURCES = {"setting": "swept", "drawn": "randomised"}
+"""Source of a sensitivity -> its word."""
+
+
+def label(column: Column) -> str:
+    """Return a quantity with its unit."""
+    return f"{column.name} ({column.unit})" if column.unit else column.name
 
 
 def tables(made: Report) -> list[Table]:

@@ -1,22 +1,30 @@
-"""The files of a report: one page, one JSON file, and a CSV file for each table."""
+"""Drawings and files of a report: one page, one JSON file, and a CSV file for each table."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
+from itertools import cycle
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from go1exp.base.files import write_json, write_text
 from go1exp.base.report.page import Page, provenance, render, sections
+from go1exp.base.report.plots import COLOURS, WIDE, Drawing, band, legend, listing, panels
 from go1exp.base.wording import counted
-from go1exp.evaluate.report.drawings import forests, importances, learning, looks
-from go1exp.evaluate.report.made import Report
-from go1exp.evaluate.report.tables import PlainRow, about_baseline, plain_rows, tables
-from go1exp.evaluate.rows import finite
-from go1exp.evaluate.statistics.compare import ORDER
+from go1exp.evaluate.quantities import finite
+from go1exp.evaluate.report.curves import AXES, Curve
+from go1exp.evaluate.report.results import Figure, Report, Sensitivity
+from go1exp.evaluate.report.tables import SOURCES, PlainRow, about_baseline, label, plain_rows, tables
+from go1exp.evaluate.statistics.runs import ORDER
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Painting
 
 NOTES = (
     "A run is one training seed, and intervals are over runs: robots moved by one policy are no independent samples of"
@@ -100,3 +108,130 @@ def write(made: Report, folder: Path) -> list[Path]:
         files.append(folder / f"{name}.csv")
         write_text(files[-1], csv_text(those))
     return files
+
+
+FEW = 6
+"""Largest number of groups that are all drawn with bands; of more, only the baseline's band is drawn."""
+
+STYLES = ("-", "--", ":", "-.")
+
+MOST = 12
+"""Quantities of a sensitivity that are drawn."""
+
+
+def short(name: str, letters: int) -> str:
+    """Return a name cut to a number of letters."""
+    return name if len(name) <= letters else f"{name[: letters - 1]}…"
+
+
+Looks = Mapping[str, tuple[str, str]]
+"""Group -> colour and line style, the same in all figures of a report."""
+
+
+def looks(groups: Sequence[str]) -> Looks:
+    """Return colour and line style of each group."""
+    return dict(zip(groups, cycle([(c, s) for s in STYLES for c in COLOURS]), strict=False))
+
+
+def learning(curves: Sequence[Curve], baseline: str, of_groups: Looks) -> list[Drawing]:
+    """Return one drawing for each metric, over steps and over time."""
+    drawings = []
+    for number, metric in enumerate(dict.fromkeys(c.metric for c in curves)):
+        of_metric = [c for c in curves if c.metric == metric]
+        caption = (
+            "Interquartile mean over runs; band: 95 % interval over runs. Curves end at the shortest run of a group."
+        )
+        if len({c.group for c in of_metric}) > FEW:
+            caption += f" With so many groups, only the band of the baseline ({baseline}) is drawn."
+        paint = partial(_learning, of_metric, baseline, of_groups)
+        drawings.append(Drawing(f"curve{number}", metric, caption, paint, wide=True))
+    return drawings
+
+
+def _learning(curves: Sequence[Curve], baseline: str, of_groups: Looks) -> Painting:
+    axes_drawn = [axis for axis in AXES if any(c.axis == axis for c in curves)]
+    names = list(dict.fromkeys(c.group for c in curves))
+    figure, axes = panels(1, len(axes_drawn), height=2.9, width=WIDE, sharey=True)
+    for panel, axis in zip(axes[0], axes_drawn, strict=True):
+        of_axis = [c for c in curves if c.axis == axis]
+        banded = [c for c in of_axis if len(names) <= FEW or c.group == baseline]
+        for curve in of_axis:
+            colour, style = of_groups[curve.group]
+            if curve in banded:
+                band(panel, curve.x, curve.low, curve.high, colour)
+            width = 1.8 if curve.group == baseline else 1.1
+            name = f"{short(curve.group, 42)} (n {curve.runs})"
+            panel.plot(curve.x, curve.middle, style, color=colour, lw=width, label=name)
+        panel.set_xlabel(AXES[axis])
+        panel.set_ylim(*_limits([c.middle for c in of_axis], [v for c in banded for v in (c.low, c.high)]))
+    axes[0][0].set_ylabel(curves[0].metric)
+    legend(figure, axes[0][0], columns=2)
+    return figure
+
+
+def _limits(middles: Sequence[Any], bounds: Sequence[Any]) -> tuple[float, float]:
+    """Return limits of the y axis that are filled by the means: bands of two or three runs are far wider."""
+    means, every = np.concatenate(middles), np.concatenate([*middles, *bounds])
+    low, high = float(means.min()), float(means.max())
+    room = 0.75 * (high - low) or 1.0
+    every = every[np.isfinite(every)]
+    return max(low - room, float(every.min()) - 0.05 * room), min(high + room, float(every.max()) + 0.05 * room)
+
+
+def forests(figures: Sequence[Figure], main: Sequence[str], baseline: str, key: str, of_groups: Looks) -> list[Drawing]:
+    """Return one drawing for each main quantity: groups from top to bottom with their intervals."""
+    drawings = []
+    for name in main:
+        those = [f for f in figures if f.column.name == name]
+        if those:
+            caption = (
+                f"{those[0].column.meaning}. Dots: runs; bar: interquartile mean with its 95 % interval over runs. "
+                f"Dashed: {baseline}."
+            )
+            paint = partial(_forest, those, baseline, of_groups)
+            title = f"{key}: {label(those[0].column)}"
+            drawings.append(Drawing(f"forest{key}{name}".replace("_", ""), title, caption, paint))
+    return drawings
+
+
+def _forest(figures: Sequence[Figure], baseline: str, of_groups: Looks) -> Painting:
+    figure, panel = listing([short(f.group, 34) for f in figures], row=0.27, label=label(figures[0].column))
+    for place, f in enumerate(figures):
+        colour, _ = of_groups[f.group]
+        panel.plot(f.values, np.full(len(f.values), place), ".", color=colour, alpha=0.45, ms=5, mec="none")
+        if np.isfinite(f.runs.low):
+            panel.plot([f.runs.low, f.runs.high], [place, place], color=colour, lw=1.6)
+        panel.plot([f.runs.estimate], [place], "|", color=colour, ms=9, mew=2)
+        if f.group == baseline:
+            panel.axvline(f.runs.estimate, color="#777777", lw=0.8, ls="--")
+    values = np.concatenate([f.values for f in figures])
+    values = values[np.isfinite(values)]
+    if len(values):
+        room = 0.6 * float(np.ptp(values)) or 0.1 * abs(float(values[0])) or 0.1
+        panel.set_xlim(values.min() - room, values.max() + room)
+    return figure
+
+
+def importances(entries: Sequence[Sensitivity], key: str) -> list[Drawing]:
+    """Return one drawing for each result: its correlates by importance."""
+    drawings = []
+    for name in dict.fromkeys(e.column.name for e in entries):
+        those = [e for e in entries if e.column.name == name and np.isfinite(e.association.importance)]
+        those = sorted(those, key=lambda e: -e.association.importance)[:MOST]
+        if those:
+            caption = (
+                "Permutation importance: share of the rank variance that the quantity explains in a linear model; dark:"
+                " significant (p after Holm at most 0.05). Swept settings are compared across runs, randomised"
+                " quantities across robots."
+            )
+            title = f"{key}: correlates of {name}"
+            drawings.append(Drawing(f"goes{key}{name}".replace("_", ""), title, caption, partial(_bars, those)))
+    return drawings
+
+
+def _bars(entries: Sequence[Sensitivity]) -> Painting:
+    names = [f"{short(e.association.name, 34)}, {SOURCES[e.source]}" for e in entries]
+    figure, panel = listing(names, label="importance")
+    colours = [COLOURS[0] if e.adjusted_p <= 0.05 else "#b9c6d0" for e in entries]
+    panel.barh(range(len(entries)), [max(e.association.importance, 0.0) for e in entries], color=colours)
+    return figure

@@ -1,4 +1,4 @@
-"""Statistics over few training runs: interquartile mean with its interval, clustered shares, bootstrap.
+"""Statistics over few training runs: interquartile mean, clustered shares, bootstrap, permutation tests, verdicts.
 
 A run is one training seed. Robots of one policy are no independent samples of a configuration, so that intervals are
 over runs. Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice" (NeurIPS
@@ -8,12 +8,16 @@ truth in 77 to 93 % instead of 95 % (docs/notebook/studies.md), so that ``iqm_in
 
 from __future__ import annotations
 
-from functools import cache
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from go1exp.evaluate.statistics.intervals import LEVEL, Interval, share_interval
+from go1exp.evaluate.statistics.intervals import LEVEL, Interval, constant, share_interval
 
 TRIM = 0.25
 """Share of the values that the interquartile mean omits at each end."""
@@ -137,3 +141,222 @@ def share_bootstrap(
 def pooled_share(counts: ArrayLike, totals: ArrayLike, level: float = LEVEL) -> Interval:
     """Return the share of falls with Wilson's interval over all robots: of these policies alone."""
     return share_interval(int(np.sum(counts)), int(np.sum(totals)), level)
+
+
+Word = Literal["better", "worse", "no significant difference"]
+Direction = Literal["lower", "higher"]
+
+ORDER: tuple[Word, ...] = ("better", "worse", "no significant difference")
+
+RESAMPLES = 20_000
+"""Permutations of a test; where there are fewer, all of them."""
+
+LEAST_RANDOM_P = 2.0 / (RESAMPLES + 1)
+"""Smallest two-sided p of random permutations, which include the observed one."""
+
+ALPHA = 1.0 - LEVEL
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Difference of a group from the baseline.
+
+    Attributes:
+        estimate: interquartile mean of the group minus that of the baseline, with Yuen's interval; n is the number of
+            runs of the smaller group, or of pairs.
+        p: of the permutation test, two-sided.
+        effect: Hedges' g, in standard deviations.
+        improvement: probability that a run of the group has more than one of the baseline; ties count half.
+        least_p: the smallest p that so few runs can give.
+    """
+
+    estimate: Interval
+    p: float
+    effect: float
+    improvement: float
+    least_p: float
+
+
+def difference(group: ArrayLike, baseline: ArrayLike, paired: bool = False, seed: int = 0) -> Difference:
+    """Return the difference of the runs (n,) of a group from those (m,) of the baseline; NaNs are ignored.
+
+    Args:
+        group: one value per run.
+        baseline: one value per run, in the same order if ``paired``.
+        paired: whether the k-th runs of both are pairs.
+        seed: of random permutations.
+    """
+    a, b = np.asarray(group, dtype=np.float64), np.asarray(baseline, dtype=np.float64)
+    if paired:
+        both = np.isfinite(a) & np.isfinite(b)
+        a, b = a[both], b[both]
+    else:
+        a, b = a[np.isfinite(a)], b[np.isfinite(b)]
+    return Difference(
+        estimate=yuen(a, b, paired),
+        p=permutation_p(a, b, paired, seed),
+        effect=hedges(a, b),
+        improvement=probability_of_improvement(a, b),
+        least_p=least_p(len(a), len(b), paired),
+    )
+
+
+def permutation_p(a: NDArray[np.float64], b: NDArray[np.float64], paired: bool = False, seed: int = 0) -> float:
+    """Return the two-sided p of the difference of runs (n,) and (m,); NaN with fewer than two runs in a group.
+
+    A permutation test of mean ranks (Wilcoxon 1945) over all, or 20,000, permutations of the runs, or within pairs. It
+    is exact for any distribution, and robust to single failed runs.
+    """
+    from scipy import stats
+
+    if min(len(a), len(b)) < 2:
+        return math.nan
+    if paired:
+        gain = a - b
+        signed = stats.rankdata(np.abs(gain)) * np.sign(gain)
+        return _p_of_ranks((tuple(np.sort(signed).tolist()),), seed) if gain.any() else 1.0
+    together = stats.rankdata(np.concatenate([a, b]))
+    if constant(np.concatenate([a, b])):
+        return 1.0
+    return _p_of_ranks(tuple(tuple(np.sort(each).tolist()) for each in np.split(together, [len(a)])), seed)
+
+
+@lru_cache(maxsize=4096)
+def _p_of_ranks(ranks: tuple[tuple[float, ...], ...], seed: int) -> float:
+    """Return the p of one sample of signed ranks, or of two samples of ranks; cached, since ranks recur."""
+    from scipy import stats
+
+    kind = "samples" if len(ranks) == 1 else "independent"
+    done = stats.permutation_test(
+        tuple(map(np.asarray, ranks)),
+        _mean_difference,
+        permutation_type=kind,
+        vectorized=True,
+        n_resamples=RESAMPLES,
+        axis=-1,
+        rng=seed,
+    )
+    return float(done.pvalue)
+
+
+def _mean_difference(*ranks: NDArray[np.float64], axis: int = -1) -> NDArray[np.float64]:
+    """Return the mean of the first sample, minus that of a second one."""
+    first = ranks[0].mean(axis=axis)
+    return np.asarray(first - ranks[1].mean(axis=axis) if len(ranks) > 1 else first)
+
+
+def least_p(n: int, m: int, paired: bool = False) -> float:
+    """Return the smallest possible two-sided p of ``permutation_p`` of n and m runs."""
+    if min(n, m) < 2:
+        return math.nan
+    ways = 2**n if paired else math.comb(n + m, n)
+    return min(1.0, max(2.0 / ways, LEAST_RANDOM_P))
+
+
+def runs_for_significance(paired: bool = False, figures: int = 1, alpha: float = ALPHA) -> int | None:
+    """Return the least number of runs per group with which one of ``figures`` comparisons can be significant.
+
+    None if no number suffices, for too many comparisons for the number of random permutations.
+    """
+    if LEAST_RANDOM_P * figures > alpha:
+        return None
+    n = 2
+    while least_p(n, n, paired) * figures > alpha:
+        n += 1
+    return n
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Return p-values adjusted for their number (Holm 1979), in the same order; NaNs stay and are not counted."""
+    p = np.asarray(p_values, dtype=np.float64)
+    adjusted = np.full_like(p, np.nan)
+    order = [int(k) for k in np.argsort(p) if np.isfinite(p[k])]
+    largest = 0.0
+    for place, k in enumerate(order):
+        largest = max(largest, min(1.0, float(p[k]) * (len(order) - place)))
+        adjusted[k] = largest
+    return [float(value) for value in adjusted]
+
+
+def yuen(a: NDArray[np.float64], b: NDArray[np.float64], paired: bool = False, level: float = LEVEL) -> Interval:
+    """Return the difference of interquartile means with Yuen's interval (1974); of pairs, that of their differences.
+
+    The interval is NaN where both groups, or the differences of pairs, are constant and the estimate is not zero.
+    """
+    from scipy import stats
+
+    parts = [a - b] if paired else [a, b]
+    n = min(len(part) for part in parts)
+    if not n:
+        return Interval(math.nan, math.nan, math.nan, 0)
+    estimate = float(iqm(parts[0]) - (0.0 if paired else iqm(b)))
+    if n < 2:
+        return Interval(estimate, math.nan, math.nan, n)
+    trim = TRIM if n >= WINSORISED_FROM else 0.0
+    if all(constant(part, trim) for part in parts):
+        bound = 0.0 if estimate == 0.0 else math.nan
+        return Interval(estimate, bound, bound, n)
+    if paired:
+        return iqm_interval(parts[0], level)
+    centred = (part - np.median(part) for part in parts)  # exact for a constant group; only the width is used
+    bounds = stats.ttest_ind(*centred, equal_var=False, trim=trim).confidence_interval(level)
+    shift = estimate - 0.5 * (bounds.low + bounds.high)
+    return Interval(estimate, float(bounds.low + shift), float(bounds.high + shift), n)
+
+
+def hedges(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """Return Hedges' g: the difference of means in pooled standard deviations, corrected for few runs; or NaN."""
+    n, m = len(a), len(b)
+    if min(n, m) < 2 or (constant(a) and constant(b)):
+        return math.nan
+    pooled = math.sqrt(((n - 1) * a.var(ddof=1) + (m - 1) * b.var(ddof=1)) / (n + m - 2))
+    return float((a.mean() - b.mean()) / pooled * (1.0 - 3.0 / (4.0 * (n + m) - 9.0)))
+
+
+def probability_of_improvement(a: ArrayLike, b: ArrayLike) -> float:
+    """Return the probability that a run of ``a`` has more than one of ``b``, ties half; of (n, tasks), mean over tasks.
+
+    The Mann-Whitney statistic over n m, as in rliable.
+    """
+    x, y = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    if not len(x) or not len(y):
+        return math.nan
+    above, equal = x[:, None] > y[None, :], x[:, None] == y[None, :]
+    return float((above + 0.5 * equal).mean())
+
+
+def runs_needed(a: NDArray[np.float64], b: NDArray[np.float64], power: float = 0.8, alpha: float = ALPHA) -> int | None:
+    """Return the runs per group needed to detect the observed difference with this power; None if undefined.
+
+    The normal approximation for two groups, with a quarter of the squared quantile for Student's: n = (z_alpha +
+    z_power)^2 (s_a^2 + s_b^2) / d^2 + z_alpha^2 / 4.
+    """
+    from scipy import stats
+
+    if min(len(a), len(b)) < 2 or a.mean() == b.mean():
+        return None
+    z_alpha, z_power = float(stats.norm.ppf(1.0 - 0.5 * alpha)), float(stats.norm.ppf(power))
+    ratio = (a.var(ddof=1) + b.var(ddof=1)) / (a.mean() - b.mean()) ** 2
+    needed = (z_alpha + z_power) ** 2 * ratio + 0.25 * z_alpha**2
+    least = runs_for_significance(alpha=alpha)
+    return max(least, math.ceil(needed)) if least is not None and needed < 1e6 else None
+
+
+def verdict_by_p(estimate: float, p: float, better: Direction, alpha: float = ALPHA) -> Word:
+    """Return the verdict on a difference, group - baseline, by its adjusted p."""
+    if not (math.isfinite(p) and p <= alpha) or estimate == 0.0:
+        return "no significant difference"
+    return "better" if (estimate > 0.0) == (better == "higher") else "worse"
+
+
+FEWEST_PAIRS = 3
+"""Pairs from which a difference may be significant: the spread of two is hardly known."""
+
+
+def verdict_by_interval(between: Interval, better: Direction) -> Word:
+    """Return the verdict on a difference, other - first, by whether its interval excludes zero; none from two pairs."""
+    if between.n < FEWEST_PAIRS or not (math.isfinite(between.low) and math.isfinite(between.high)):
+        return "no significant difference"
+    if between.low > 0.0 or between.high < 0.0:
+        return "better" if (between.low > 0.0) == (better == "higher") else "worse"
+    return "no significant difference"

@@ -13,7 +13,7 @@ from go1exp.base.report import plots
 from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import NonNegative, Positive, protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.observed import TrunkVelocity
+from go1exp.evaluate.controller.types import TrunkVelocity
 from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, lives, repeated
 from go1exp.evaluate.protocol.signals import Signal
 from go1exp.evaluate.quantities import Column, Derived, Row, values

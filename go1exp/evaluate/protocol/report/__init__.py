@@ -1,1 +1,0 @@
-"""Reports of protocols and of comparisons: one HTML page each."""
