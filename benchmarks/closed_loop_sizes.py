@@ -57,7 +57,7 @@ SIZES = {
     "full": Size(
         robots=tuple(hidden.SECRETS),
         # A policy that has seen ideal drives on nominal robots only.
-        task=("experiment=trot", "actuator=pd", "effect=none", "rand=none"),
+        task=("experiment=clock", "actuator=pd", "effect=none", "rand=none"),
         first=(),
         walker=("ppo.iterations=50",),
         # At the task's 3e-4 one update of one of 21 trainings threw its policy away.
@@ -66,7 +66,7 @@ SIZES = {
         ground=Ground(time_constant=0.005),
         recordings=8,
         seconds=5.0,
-        search=("contact=stiff",),  # that of experiment=trot, with 5 ms
+        search=("contact=stiff",),  # that of experiment=clock, with 5 ms
         for_net=(20, 5.0),
         net=(*NET, "epochs=60"),
         commands=(*SLOW, *FAST),

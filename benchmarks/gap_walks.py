@@ -1,4 +1,4 @@
-"""Names from walks: ``python -m benchmarks.gap_walks out=FILE seed=INT [scale=1] [policy=trot]``.
+"""Names from walks: ``python -m benchmarks.gap_walks out=FILE seed=INT [scale=1] [policy=clock]``.
 
 ``[episodes=4] [seconds=6] [phase=swing] [kinds=hidden,null] [effects=coulomb,strength] [size=5]``: walks of a case and
 their length; what of them is compared; what is drawn; which effects are hidden, and how large, in tolerances.
@@ -28,7 +28,7 @@ import numpy as np
 from benchmarks.results import write_results
 
 USAGE = (
-    "usage: python -m benchmarks.gap_walks out=FILE seed=INT [scale=1] [policy=trot] [episodes=4] [seconds=6] "
+    "usage: python -m benchmarks.gap_walks out=FILE seed=INT [scale=1] [policy=clock] [episodes=4] [seconds=6] "
     "[phase=swing] [kinds=hidden,null] [effects=coulomb,strength] [size=5]"
 )
 
@@ -149,7 +149,7 @@ def figures(counts: Mapping[str, Sequence[bool]]) -> dict[str, float | int | str
 def main(arguments: Sequence[str]) -> None:
     """Walk, search, count."""
     given = dict(a.split("=", 1) for a in arguments if "=" in a)
-    usual = {"scale": "1", "policy": "trot", "episodes": "4", "seconds": "6", "phase": "swing", "kinds": "hidden,null"}
+    usual = {"scale": "1", "policy": "clock", "episodes": "4", "seconds": "6", "phase": "swing", "kinds": "hidden,null"}
     usual |= {"effects": USUAL, "size": "5"}
     if not {"out", "seed"} <= set(given) <= {"out", "seed", *usual} or len(given) != len(arguments):
         raise SystemExit(USAGE)

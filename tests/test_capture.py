@@ -60,7 +60,7 @@ CHANGING = (
 
 
 @pytest.mark.parametrize(
-    "choices", [(*ROUGH, "+observation.height_scan={}"), ("experiment=trot", "backend=cpu"), ("reward=paper_literal",)]
+    "choices", [(*ROUGH, "+observation.height_scan={}"), ("experiment=clock", "backend=cpu"), ("reward=paper_literal",)]
 )
 def test_a_step_holds_nothing_that_a_graph_cannot(choices: tuple[str, ...], make_core: Callable[..., Go1Core]) -> None:
     core = make_core(*choices)

@@ -588,7 +588,7 @@ def test_a_place_for_results_that_cannot_be_written_to_is_refused_before_the_wor
     words: tuple[str, ...], key: str, run: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "file").touch()
-    subject = "subjects=[paper,trot]" if words[0] == "compare" else f"run={run}"
+    subject = "subjects=[paper,clock]" if words[0] == "compare" else f"run={run}"
     done = refuse(tmp_path, words[0], subject, *words[1:])
     assert done.returncode == 2, done.stderr
     assert done.stdout == ""

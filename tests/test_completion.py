@@ -25,7 +25,7 @@ from go1exp.sim.task import PPOConfig
 PROGRAM = "import sys; from go1exp.cli import main; sys.exit(main())"
 
 
-POLICIES = ("paper", "robust", "robust_history", "trot")
+POLICIES = ("clock", "paper", "robust", "robust_history")
 """Shipped ones."""
 
 
@@ -85,7 +85,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             "train start_from=",
             {
                 f"start_from={f}"
-                for f in ("paper", "robust", "robust_history", "trot", "gap/", "logs/", "mine/", "runs/")
+                for f in ("clock", "paper", "robust", "robust_history", "gap/", "logs/", "mine/", "runs/")
             },
         ),
         ("train --he", {"--help"}),

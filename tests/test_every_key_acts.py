@@ -138,7 +138,7 @@ NEEDS = {
     "reward/paper": ["schedule=none"],  # which sets three of its weights
     "curriculum/terrain_level": ["terrain=rough"],
     "critic/terrain": ["terrain=rough"],
-    "experiment/trot": [  # it changes what these say
+    "experiment/clock": [  # it changes what these say
         *("observation=clock", "reward=clock", "ppo=warp", "command=widening", "actuator=delay"),
         "observation.gait_clock.rate=3.1",  # neither the file's nor the experiment's, which the rewards take over
     ],
@@ -152,7 +152,7 @@ NEEDS = {
     "experiment/five_minutes_part/no_near_kernels": ["experiment=five_minutes"],
     "experiment/study": ["experiment=paper", "actuator=delay", "backend=cpu"],
     "experiment/study_cpu": ["experiment=study", "backend=cpu", "ppo=small"],
-    "experiment/robust": ["experiment=trot", "backend=cpu"],
+    "experiment/robust": ["experiment=clock", "backend=cpu"],
     "experiment/robust_history": ["experiment=robust", "backend=cpu"],
 }
 """Choices that other choices must go with."""

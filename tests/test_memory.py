@@ -39,7 +39,7 @@ def test_a_gif_that_does_not_fit_is_refused_by_its_key_and_a_film_is_not(
     """Of a GIF every picture is kept until it is written; of a film none is."""
     monkeypatch.setattr(memory, "free", lambda: 25 * video.GIF_BYTES * 40)
     monkeypatch.setattr(video, "record", lambda *anything, **options: iter(()))
-    clip = ["policy=trot", "viewer=clip", "seconds=50", "fps=25"]
+    clip = ["policy=clock", "viewer=clip", "seconds=50", "fps=25"]
     with pytest.raises(ConfigError, match=r"^seconds = 50: a GIF .* 40 s at most would fit; an \.mp4 of any length"):
         PLAY.task(begin("play", compose("play", [*clip, f"out={tmp_path / 'clip.gif'}"])))
     with pytest.raises(ValueError, match="at least one frame"):  # none came, and the length was not in the way
@@ -61,10 +61,10 @@ def test_a_gif_that_does_not_fit_is_refused_by_its_key_and_a_film_is_not(
         (("seconds=100", "repeats=2"), "seconds = 100: with 5 recordings .*; 40 s at most would fit"),
         (("seconds=1e308",), "seconds = 1e\\+308: with 3 recordings it takes at least inf GB, .*; 66 s at most would"),
         (
-            ("excitation=[policy]", "policy=trot", "episodes=11"),
+            ("excitation=[policy]", "policy=clock", "episodes=11"),
             "episodes = 11: 11 .*; 10 at most would fit",
         ),
-        (("excitation=[policy]", "policy=trot", "seconds=201"), "seconds = 201: with 4 recordings .*; 50 s at most"),
+        (("excitation=[policy]", "policy=clock", "seconds=201"), "seconds = 201: with 4 recordings .*; 50 s at most"),
     ],
 )
 def test_recordings_that_do_not_fit_are_refused_by_the_key_that_asks_for_so_many(
@@ -260,10 +260,10 @@ def test_a_length_beyond_all_numbers_is_refused_too(stage: Stage) -> None:
 @pytest.mark.parametrize(
     ("verb", "overrides", "words"),
     [
-        ("eval", ("policy=trot", "duration_s=1e308"), "duration_s = 1e+308: input should be less than or equal to"),
-        ("eval", ("policy=trot", "duration_s=0.4", "settle_s=0.399"), "duration_s = 0.4: no step of the policy (0.02"),
-        ("play", ("policy=trot", "viewer=clip", "seconds=1e308"), "seconds = 1e+308: input should be less than or eq"),
-        ("play", ("policy=trot", "viewer=clip", "seconds=0.001"), "seconds = 0.001: shorter than a picture at fps ="),
+        ("eval", ("policy=clock", "duration_s=1e308"), "duration_s = 1e+308: input should be less than or equal to"),
+        ("eval", ("policy=clock", "duration_s=0.4", "settle_s=0.399"), "duration_s = 0.4: no step of the policy (0.02"),
+        ("play", ("policy=clock", "viewer=clip", "seconds=1e308"), "seconds = 1e+308: input should be less than or eq"),
+        ("play", ("policy=clock", "viewer=clip", "seconds=0.001"), "seconds = 0.001: shorter than a picture at fps ="),
         ("record", ("seconds=0.0001",), "seconds = 0.0001: shorter than a sample of the motion at"),
     ],
 )

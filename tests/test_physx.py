@@ -455,7 +455,7 @@ def test_it_trains_nothing(make_task: Callable[..., TaskConfig]) -> None:
 
 @needs_physx
 def test_a_shipped_policy_walks_in_physx_as_in_mujoco() -> None:
-    config, policy, _ = load_run(shipped_policies()["trot"])
+    config, policy, _ = load_run(shipped_policies()["clock"])
     task = subjects.with_robot(config.task, subjects.split_robot(compose("eval", ["contact=elliptic"]))[0])
     reports = []
     for engine in (PHYSX, CPU):

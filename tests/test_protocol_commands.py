@@ -62,29 +62,29 @@ def compared(folder: Path, *overrides: str) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ("eval policy=trot protocol=sinusoids", ("sinusoids", "did you mean 'sinusoid'")),
-        ("eval policy=trot protocol=sinusoid noise=true", ("noise = True", "protocol.sinusoid.noise")),
-        ("eval policy=trot protocol=kicks episodes=3", ("episodes = 3", "protocol.kicks.robots")),
-        ("eval policy=trot folder=there", ("folder = 'there'", "out=")),
-        ("eval policy=trot protocol.kicks.robots=3", ("protocol.kicks",)),
-        ("eval policy=trot protocol=kicks protocol.kicks.measures=[strides]", ("unknown measure term 'strides'",)),
+        ("eval policy=clock protocol=sinusoids", ("sinusoids", "did you mean 'sinusoid'")),
+        ("eval policy=clock protocol=sinusoid noise=true", ("noise = True", "protocol.sinusoid.noise")),
+        ("eval policy=clock protocol=kicks episodes=3", ("episodes = 3", "protocol.kicks.robots")),
+        ("eval policy=clock folder=there", ("folder = 'there'", "out=")),
+        ("eval policy=clock protocol.kicks.robots=3", ("protocol.kicks",)),
+        ("eval policy=clock protocol=kicks protocol.kicks.measures=[strides]", ("unknown measure term 'strides'",)),
         ("eval bundle=nowhere.zip protocol=kicks", ("bundle = 'nowhere.zip'", "no such file")),
-        ("eval bundle=a.zip policy=trot protocol=kicks", ("only one of them",)),
+        ("eval bundle=a.zip policy=clock protocol=kicks", ("only one of them",)),
         ("eval bundle=a.zip", ("protocol=grid takes run or policy",)),
         ("eval protocol=kicks", ("run: required",)),
-        ("compare trot", ("subjects = ['trot']", "at least 2")),
-        ("compare", ("subjects: required, such as go1exp compare trot paper protocol=kicks",)),
-        ("compare trot trot", ("each only once",)),
-        ("compare trot nothing", ("'nothing' is no run folder, no bundle (.zip), no shipped policy",)),
-        ("compare trot trot@5hz", ("'trot@5hz': after @ comes a rate of 10 to 1000 hz",)),
-        ("compare trot mpc@mujco", ("'mpc@mujco': after @ comes", "mujoco or physx")),
+        ("compare clock", ("subjects = ['clock']", "at least 2")),
+        ("compare", ("subjects: required, such as go1exp compare clock paper protocol=kicks",)),
+        ("compare clock clock", ("each only once",)),
+        ("compare clock nothing", ("'nothing' is no run folder, no bundle (.zip), no shipped policy",)),
+        ("compare clock clock@5hz", ("'clock@5hz': after @ comes a rate of 10 to 1000 hz",)),
+        ("compare clock mpc@mujco", ("'mpc@mujco': after @ comes", "mujoco or physx")),
         ("eval controller=mpc protocol=rate", ("protocol=rate: varies the rate of a policy; mpc has one of its own",)),
-        ("eval policy=trot protocol=rate policy_dt=0.01", ("policy_dt = 0.01: protocol=rate has rates of its own",)),
-        ("compare trot mpc protocol=paper", ("subjects: mpc has a rate of its own; leave rate out",)),
-        ("compare trot trot@estimated protocol=rate", ("trot@estimated is varied in what protocol=rate varies",)),
+        ("eval policy=clock protocol=rate policy_dt=0.01", ("policy_dt = 0.01: protocol=rate has rates of its own",)),
+        ("compare clock mpc protocol=paper", ("subjects: mpc has a rate of its own; leave rate out",)),
+        ("compare clock clock@estimated protocol=rate", ("clock@estimated is varied in what protocol=rate varies",)),
         ("eval controller=mpc bundle=a.zip protocol=kicks", ("bundle = 'a.zip': is a policy",)),
-        ("eval controller=mpc policy=trott protocol=kicks", ("unknown shipped policy 'trott'",)),
-        ("compare trot paper protocol=grid", ("protocol=grid", "go1exp eval")),
+        ("eval controller=mpc policy=clockk protocol=kicks", ("unknown shipped policy 'clockk'",)),
+        ("compare clock paper protocol=grid", ("protocol=grid", "go1exp eval")),
     ],
 )
 def test_what_is_wrong_is_said_at_once(arguments: str, said: tuple[str, ...], tmp_path: Path) -> None:
@@ -188,7 +188,7 @@ def test_the_same_subject_under_another_name_is_equal(run: Path, tmp_path: Path)
 
 
 def test_same_robot_seed_and_physics_step_act(run: Path, tmp_path: Path) -> None:
-    pair = f"subjects=[trot,{run}]"
+    pair = f"subjects=[clock,{run}]"
     rows = {}
     for name, change in {
         "plain": (),
@@ -198,17 +198,17 @@ def test_same_robot_seed_and_physics_step_act(run: Path, tmp_path: Path) -> None
     }.items():
         compared(tmp_path / name, pair, *change)
         every = pq.read_table(tmp_path / name / "corners.parquet").to_pylist()
-        rows[name] = {s: [r["rmse_x"] for r in every if r["subject"] == s] for s in ("trot", str(run))}
-    assert rows["plain"]["trot"] == rows["own"]["trot"]
+        rows[name] = {s: [r["rmse_x"] for r in every if r["subject"] == s] for s in ("clock", str(run))}
+    assert rows["plain"]["clock"] == rows["own"]["clock"]
     assert rows["plain"][str(run)] != rows["own"][str(run)]
     for name in ("seed", "dt"):
-        assert rows[name]["trot"] != rows["plain"]["trot"]
+        assert rows[name]["clock"] != rows["plain"]["clock"]
 
 
 def test_words_name_subjects(run: Path, bundle: Path) -> None:
     named, variation = subjects.varied(f"{run}@100hz@estimated", "x")
     assert (named.run, variation.policy_dt, variation.trunk_velocity) == (run, 0.01, "estimated")
     assert subjects.word(str(bundle), "x").bundle == bundle
-    assert np.isclose(subjects.varied("trot@33.3hz", "x")[1].policy_dt or 0.0, 1 / 33.3)
+    assert np.isclose(subjects.varied("clock@33.3hz", "x")[1].policy_dt or 0.0, 1 / 33.3)
     with pytest.raises(ConfigError, match="after @ comes"):
-        subjects.varied("trot@fast", "x")
+        subjects.varied("clock@fast", "x")

@@ -88,7 +88,7 @@ def test_conditions_in_words() -> None:
 
 
 def test_tables_have_no_row_without_a_figure_and_one_row_for_a_condition() -> None:
-    one = made("hardware", "trot", hardware)
+    one = made("hardware", "clock", hardware)
     tables = figure_tables(one.summary, meanings(one))
     conditions = len({(r["x"], r["y"], r["yaw"], r["delay_ms"]) for r in one.played.rows})
     assert len(tables[0].rows) == conditions
@@ -104,7 +104,7 @@ def test_tables_have_no_row_without_a_figure_and_one_row_for_a_condition() -> No
 
 
 def test_the_head_says_the_verdicts() -> None:
-    one = made("hardware", "trot", hardware)
+    one = made("hardware", "clock", hardware)
     head = page(one).split("</header>")[0]
     for v in one.verdicts:
         assert v.name.replace("_", " ") in head
@@ -124,7 +124,7 @@ def test_units_are_those_of_the_ground() -> None:
     }
     summary = [{"condition": {"ground": g, "speed": 1.0}, "figures": {"at_half": f}} for g, f in half.items()]
     verdicts = evaluated(one.protocol.claims, summary)
-    result = Result(one, "trot", {}, Played([]), 0, summary, verdicts, 1.0)
+    result = Result(one, "clock", {}, Played([]), 0, summary, verdicts, 1.0)
     claims = {row[0]: row for row in claims_table(result, meanings(result)).rows}
     assert claims["incline"][3] == "at least 15 deg"
     (table,) = figure_tables(summary, meanings(result))
@@ -134,7 +134,7 @@ def test_units_are_those_of_the_ground() -> None:
 
 
 def test_meanings_are_words() -> None:
-    for unit, meaning in meanings(made("hardware", "trot", hardware)).values():
+    for unit, meaning in meanings(made("hardware", "clock", hardware)).values():
         assert meaning
         assert "`" not in meaning
         assert "(N" not in meaning
@@ -144,7 +144,7 @@ def test_meanings_are_words() -> None:
 @needs_chromium
 @pytest.mark.parametrize("which", ["hardware", "compare"])
 def test_no_element_is_wider_than_a_phone(which: str, tmp_path: Path) -> None:
-    seen = on_a_phone(page(made("hardware", "trot", hardware)) if which == "hardware" else compared_page(), tmp_path)
+    seen = on_a_phone(page(made("hardware", "clock", hardware)) if which == "hardware" else compared_page(), tmp_path)
     assert seen["page"] <= seen["width"] == PHONE
     assert seen["all"] > 100
     assert seen["wide"] == []

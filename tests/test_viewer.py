@@ -47,15 +47,15 @@ GO1 = parse_parts(compose("train", []), ("robot",))[0]["robot"]
 
 @pytest.fixture(scope="module")
 def robots() -> Robots:
-    """Everything that ``go1exp play policy=trot viewer=web`` offers."""
-    subject = named(None, "trot", None, None, "play.mp4")
+    """Everything that ``go1exp play policy=clock viewer=web`` offers."""
+    subject = named(None, "clock", None, None, "play.mp4")
     first = agent(subject, {})
     return Robots(_agents(subject, first, {}), _grounds(None)[1], catalogue(first.task.effect, False)[0])
 
 
 @pytest.fixture
 def session(robots: Robots) -> Session:
-    return Session(robots, "trot", Setup(), (0.0, 0.0, 0.0))
+    return Session(robots, "clock", Setup(), (0.0, 0.0, 0.0))
 
 
 def walk(session: Session, seconds: float) -> None:
@@ -166,7 +166,7 @@ def test_what_cannot_be_is_refused_and_changes_nothing(session: Session, request
     session.ask(request_)
     assert why in session.message
     assert "\n" not in session.message
-    assert (session.core, session.setup, session.label) == (core, setup, "trot")
+    assert (session.core, session.setup, session.label) == (core, setup, "clock")
     session.advance()
     assert session.history.count == history + 1
 
@@ -420,7 +420,7 @@ def test_without_studio_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch)
 
 def test_setup_that_does_not_fit_is_a_refusal(robots: Robots) -> None:
     with pytest.raises(ConfigError, match="moon"):
-        Session(robots, "trot", Setup(ground="moon"), (0.0, 0.0, 0.0))
+        Session(robots, "clock", Setup(ground="moon"), (0.0, 0.0, 0.0))
 
 
 def test_the_page_of_the_documentation_names_the_keys_of_the_window() -> None:

@@ -170,7 +170,7 @@ def test_strangers_are_refused_and_the_page_is_served() -> None:
 
 @pytest.mark.slow(*PARTS)
 def test_the_command_ends_by_ctrl_c_and_a_second_one_takes_the_next_port(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", "from go1exp.cli import main; raise SystemExit(main())", "play", "policy=trot"]
+    command = [sys.executable, "-c", "from go1exp.cli import main; raise SystemExit(main())", "play", "policy=clock"]
 
     def start() -> subprocess.Popen[str]:
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}

@@ -105,7 +105,7 @@ def test_a_bundle_walks_on_the_page_and_hands_over(
     assert session.time == pytest.approx(5 * session.dt)
     assert np.isfinite(session.qpos()).all()
     assert not np.array_equal(session.qpos(), before)
-    for label in ("trot", "mine"):  # to a policy of the package and back, while it walks
+    for label in ("clock", "mine"):  # to a policy of the package and back, while it walks
         show.ask(ask.SelectPolicy(label))
         assert (session.label, session.message) == (label, "")
         show.tick()

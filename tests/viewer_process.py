@@ -1,4 +1,4 @@
-"""The robot of ``policy=trot`` on a page, in a process of its own, which says what it does in lines of JSON.
+"""The robot of ``policy=clock`` on a page, in a process of its own, which says what it does in lines of JSON.
 
 The page's process says in the same way what its window draws.
 
@@ -78,10 +78,10 @@ class TellingWindow(DriveWindow):
 def main() -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where pytest runs in a shell's background
     torch.set_num_threads(1)
-    first = agent(named(None, "trot", None, None, "play.mp4"), {})
-    subject = named(None, "trot", None, None, "play.mp4")
+    first = agent(named(None, "clock", None, None, "play.mp4"), {})
+    subject = named(None, "clock", None, None, "play.mp4")
     robots = Robots(_agents(subject, first, {}), _grounds(None)[1], catalogue(first.task.effect, False)[0])
-    session = Session(robots, "trot", Setup(), (0.0, 0.0, 0.0))
+    session = Session(robots, "clock", Setup(), (0.0, 0.0, 0.0))
     pad = Gamepad()
     web.run(
         Telling(session),

@@ -318,7 +318,7 @@ def parse_with_groups(
 EXAMPLES = {
     "space": """'space=["ppo.gamma=interval(0.97,0.995)"]'""",
     "run": "run=runs/NAME",
-    "subjects": "go1exp compare trot paper protocol=kicks",
+    "subjects": "go1exp compare clock paper protocol=kicks",
     "folders": "go1exp report runs/sweep_NAME",
     "files": "go1exp record audit recordings/NAME.parquet",
     "file": "go1exp export check runs/NAME/bundle.zip",

@@ -216,7 +216,7 @@ class Variation:
 
 
 def varied(given: str, file: str) -> tuple[Named, Variation]:
-    """Return the subject of a word such as trot, mpc, trot@100hz, runs/NAME@estimated, trot@100hz@physx.
+    """Return the subject of a word such as clock, mpc, clock@100hz, runs/NAME@estimated, clock@100hz@physx.
 
     Raises:
         ConfigError: if it is not there, or is varied in a way that is not known.
