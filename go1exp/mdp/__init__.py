@@ -3,16 +3,7 @@
 Importing the package registers every term, from this explicit list.
 """
 
-from go1exp.mdp import (
-    commands,
-    curricula,
-    events,
-    observations,
-    randomizations,
-    rewards,
-    rewards_literal,
-    terminations,
-)
+from go1exp.mdp import commands, curricula, events, observations, randomizations, rewards, rewards_literal, terminations
 
 __all__ = [
     "commands",

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
+from torch import Tensor
 
 from go1exp.base.tensors.memory import Memory
 from go1exp.base.tensors.randomness import Stream
 from go1exp.config.schema.registry import PositiveRange, SpeedRange, event
 from go1exp.mdp.kinematics import KinematicState
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 @event("push")

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
+from torch import Tensor
 
 from go1exp import robot
 from go1exp.base.tensors.memory import Memory
-
-if TYPE_CHECKING:
-    import torch
-    from torch import Tensor
 
 
 class FootTimers(Memory):

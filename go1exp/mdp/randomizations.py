@@ -7,10 +7,11 @@ write the state of a reset. All draws are independent per element. Table I of th
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import torch
 from pydantic import AfterValidator, Field
+from torch import Tensor
 
 from go1exp import robot
 from go1exp.base.tensors.memory import constant_like
@@ -20,9 +21,6 @@ from go1exp.base.tensors.rotation import quat_from_rotvec, quat_multiply
 from go1exp.config.schema.registry import PositiveRange, Range, SpeedRange, ordered, randomization
 from go1exp.mdp.kinematics import KinematicState
 from go1exp.robot.actuators import ModelFields
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 JOINT_POS_LIMITS = tuple(tuple(bound) for bound in robot.JOINT_POS_LIMITS.T.tolist())
 """Lower and upper, rad."""
@@ -81,13 +79,7 @@ def _spring(model: ModelFields) -> tuple[Tensor, Tensor]:
 
 
 @randomization("foot_restitution", kind="model", fields=("geom_solref",), sets=FEET_CONTACT)
-def foot_restitution(
-    model: ModelFields,
-    stream: Stream,
-    mask: Tensor,
-    *,
-    range: RestitutionRange = (0.1, 0.3),
-) -> None:
+def foot_restitution(model: ModelFields, stream: Stream, mask: Tensor, *, range: RestitutionRange = (0.1, 0.3)) -> None:
     """Coefficient of restitution of each foot, 0.02 to 0.7, by the damper of its contact; the spring stays.
 
     MuJoCo's contact is a spring-damper; its default ratio of 1 returns exp(-2) = 0.135 of the speed, less what gravity
@@ -158,11 +150,7 @@ def body_orientation(state: KinematicState, stream: Stream, *, range: Range = (-
 
 @randomization("joint_positions", kind="state")
 def joint_positions(
-    state: KinematicState,
-    stream: Stream,
-    *,
-    range: Range = (-0.3, 0.3),
-    operation: Literal["add", "scale"] = "scale",
+    state: KinematicState, stream: Stream, *, range: Range = (-0.3, 0.3), operation: Literal["add", "scale"] = "scale"
 ) -> None:
     """Initial joint angles: q0 (1 + draw) for ``scale``, q0 + draw rad for ``add``; cut at the hard limits.
 

@@ -6,16 +6,14 @@ The time limit is not a term: it truncates, and belongs to ``sim.episode_s``.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import torch
 from pydantic import Field
+from torch import Tensor
 
 from go1exp.config.schema.registry import termination
 from go1exp.mdp.types import Snapshot
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 @termination("trunk_contact")

@@ -116,12 +116,7 @@ def dtype_of(fields: tuple[Field, ...], **parts: tuple[np.dtype[Any], tuple[int,
 
 COMMAND = (
     *_BEGIN,
-    Field(
-        "motor",
-        "V27",
-        "MOTOR_COMMAND, 20 of them: FR FL RR RL x hip thigh calf, then 8 unused",
-        TRIED,
-    ),
+    Field("motor", "V27", "MOTOR_COMMAND, 20 of them: FR FL RR RL x hip thigh calf, then 8 unused", TRIED),
     Field("battery_off", "(4,)u1", "0xA5 in the first byte switches the battery off; the rest is reserve", SDK),
     *_END,
     *_CRC,
@@ -139,8 +134,5 @@ STATE = (
 )
 COMMAND_TYPE = dtype_of(COMMAND, motor=(dtype_of(MOTOR_COMMAND), (MOTORS,)))
 STATE_TYPE = dtype_of(
-    STATE,
-    imu=(dtype_of(IMU), ()),
-    motor=(dtype_of(MOTOR_STATE), (MOTORS,)),
-    battery=(dtype_of(BATTERY), ()),
+    STATE, imu=(dtype_of(IMU), ()), motor=(dtype_of(MOTOR_STATE), (MOTORS,)), battery=(dtype_of(BATTERY), ())
 )

@@ -323,11 +323,7 @@ IR_VERSION = 10
 
 
 def write_onnx(
-    path: Path,
-    weights: Sequence[np.ndarray],
-    biases: Sequence[np.ndarray],
-    skip: np.ndarray,
-    about: Mapping[str, str],
+    path: Path, weights: Sequence[np.ndarray], biases: Sequence[np.ndarray], skip: np.ndarray, about: Mapping[str, str]
 ) -> None:
     """Write ``features`` -> ``torque``: float32 (R, F) -> (R,) for one net, (K, R, F) -> (K, R) for several.
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import torch
+from torch import Tensor
 
 from go1exp.config.schema.joint_values import JointValues, each_within
 from go1exp.config.schema.registry import actuator
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.actuator.setup import Gains
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 def envelope(qd: Tensor, effort: Tensor, stall: Tensor, speed: Tensor) -> tuple[Tensor, Tensor]:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import inspect
-from typing import TYPE_CHECKING, Any, Protocol, TypeGuard, runtime_checkable
+from typing import Any, Protocol, TypeGuard, runtime_checkable
+
+from torch import Tensor
 
 from go1exp.base.tensors.memory import Memory
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 class Actuator(Protocol):

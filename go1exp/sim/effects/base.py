@@ -9,18 +9,16 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, Field
+from torch import Tensor
 
 from go1exp.base.tensors.memory import Memory
 from go1exp.config.schema.joint_values import JointValues, each_within
 from go1exp.config.schema.physics import ContactConfig
 from go1exp.robot.actuators import ActuatorSetup, ModelFields
 from go1exp.sim.effects.identification import Identification
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 @dataclass(frozen=True)

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
+from torch import Tensor
 
 from go1exp.config.schema.registry import effect
 from go1exp.robot.go1_fields import KD_STEP, KP_STEP, TORQUE_STEP
 from go1exp.sim.effects.base import Effect, Param
 from go1exp.sim.effects.identification import TWO_ATTITUDES, TWO_GAIN_SETS, TWO_KD, Identification
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 @effect("dead_band")
@@ -84,10 +80,7 @@ class FixedPoint(Effect):
     title = "fixed-point numbers in commands and reported torques"
     params = (Param("steps", "-", 0.0, 8.0, 0.0, 1.0, "robot", "steps over those of a Go1's packets; 0: none"),)
     identification = Identification(
-        levels=({"steps": 4.0},),
-        excitation="torque_off",
-        confounded=("viscous",),
-        separated_by=TWO_KD,
+        levels=({"steps": 4.0},), excitation="torque_off", confounded=("viscous",), separated_by=TWO_KD
     )
     order = -10
     steps: Tensor
@@ -122,11 +115,7 @@ class KdScale(Effect):
     title = "a change of the velocity gain"
     params = (Param("scale", "-", 0.0, 3.0, 1.0, 0.15, "joint", "real gain over configured gain"),)
     identification = Identification(
-        nominal=True,
-        rank=1,
-        excitation="torque_off",
-        confounded=("viscous",),
-        separated_by=TWO_KD,
+        nominal=True, rank=1, excitation="torque_off", confounded=("viscous",), separated_by=TWO_KD
     )
     scale: Tensor
 

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
+from torch import Tensor
 
 from go1exp.base.tensors.memory import DelayLine
+from go1exp.config.schema.joint_values import JointValues
 from go1exp.config.schema.registry import effect
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.effects.base import Effect, Param
 from go1exp.sim.effects.identification import SHARP_EDGES, Identification
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from go1exp.config.schema.joint_values import JointValues
 
 
 class Delayed(Effect):
@@ -63,12 +60,7 @@ class CommandDelay(Delayed):
 
     title = "a delay of commands"
     params = (Param("delay", "s", 0.0, 0.06, 0.0, 0.001, "joint", "age of the target"),)
-    identification = Identification(
-        nominal=True,
-        rank=10,
-        levels=({"delay": 0.01},),
-        excitation="steps",
-    )
+    identification = Identification(nominal=True, rank=10, levels=({"delay": 0.01},), excitation="steps")
 
     def __init__(self, setup: ActuatorSetup, **values: JointValues) -> None:
         """Allocate the past of targets; that of feed-forward torques is allocated with the first of them."""
@@ -113,11 +105,7 @@ class TorqueDelay(Delayed):
     title = "a delay of torque"
     params = (Param("delay", "s", 0.0, 0.02, 0.0, 0.001, "joint", "age of the torque"),)
     identification = Identification(
-        nominal=True,
-        rank=11,
-        excitation="steps",
-        confounded=("lag",),
-        separated_by=SHARP_EDGES,
+        nominal=True, rank=11, excitation="steps", confounded=("lag",), separated_by=SHARP_EDGES
     )
     order = 30
 
@@ -137,10 +125,7 @@ class Lag(Effect):
 
     title = "a lag of torque"
     params = (Param("time", "s", 0.0, 0.05, 0.0, 0.001, "joint", "time constant"),)
-    identification = Identification(
-        confounded=("torque_delay",),
-        separated_by=SHARP_EDGES,
-    )
+    identification = Identification(confounded=("torque_delay",), separated_by=SHARP_EDGES)
     memory = ("_made", "_asked", "_fresh")
     order = 40
     time: Tensor

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
 from go1exp.config.schema.registry import effect
 from go1exp.robot.actuators import ModelFields
 from go1exp.sim.effects.base import Effect, Param
 from go1exp.sim.effects.identification import TWO_KD, Identification
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 @effect("asymmetric_friction")
@@ -141,10 +138,7 @@ class Stribeck(Effect):
         Param("exponent", "-", 0.5, 4.0, 2.0, math.inf, "joint", "how suddenly it fades"),
     )
     identification = Identification(
-        shapes=({"speed": 0.1}, {"speed": 0.5}),
-        free_shapes=("speed",),
-        simpler="coulomb",
-        excitation="slow_ramps",
+        shapes=({"speed": 0.1}, {"speed": 0.5}), free_shapes=("speed",), simpler="coulomb", excitation="slow_ramps"
     )
     strength: Tensor
     speed: Tensor
@@ -167,11 +161,7 @@ class Viscous(Effect):
     title = "viscous friction"
     params = (Param("damping", "N m s/rad", 0.0, 2.0, 0.0, 0.02, "joint", "torque per speed"),)
     identification = Identification(
-        nominal=True,
-        rank=5,
-        excitation="torque_off",
-        confounded=("kd_scale",),
-        separated_by=TWO_KD,
+        nominal=True, rank=5, excitation="torque_off", confounded=("kd_scale",), separated_by=TWO_KD
     )
     damping: Tensor
 

@@ -23,18 +23,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
 from go1exp.base.tensors.memory import Memory
 from go1exp.config.schema.registry import effect
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.effects.base import Effect, Gears, Param
 from go1exp.sim.effects.identification import Identification
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 LIGHTEST = 1e-5
 """A rotor counts for at least this, kg m2; the Go1's have 0.004 and more."""
@@ -51,10 +48,7 @@ class Backlash(Effect):
 
     title = "play in the gears"
     params = (Param("gap", "rad", 0.0, 0.1, 0.0, 0.001, "joint", "free angle from flank to flank"),)
-    identification = Identification(
-        levels=({"gap": 0.002}, {"gap": 0.015}),
-        excitation="slow_ramps",
-    )
+    identification = Identification(levels=({"gap": 0.002}, {"gap": 0.015}), excitation="slow_ramps")
     gap: Tensor
 
     def on_gears(self, gears: Gears) -> Gears:
@@ -78,9 +72,7 @@ class Flexibility(Effect):
         Param("compliance", "rad/(N m)", 0.0, 0.02, 0.0, 5e-4, "joint", "twist per torque"),
         Param("damping", "-", 0.02, 1.0, 0.05, math.inf, "joint", "damping ratio of the rotor on this spring"),
     )
-    identification = Identification(
-        levels=({"compliance": 0.001}, {"compliance": 0.004}),
-    )
+    identification = Identification(levels=({"compliance": 0.001}, {"compliance": 0.004}))
     compliance: Tensor
     damping: Tensor
 

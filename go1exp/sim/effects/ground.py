@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
 from go1exp import robot
 from go1exp.config.schema.physics import ContactConfig
@@ -13,9 +13,6 @@ from go1exp.config.schema.registry import effect
 from go1exp.robot.actuators import ModelFields
 from go1exp.sim.effects.base import Effect, Param
 from go1exp.sim.effects.identification import Identification
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 @effect("foot_friction")
@@ -30,11 +27,7 @@ class FootFriction(Effect):
     title = "a change of foot friction"
     params = (Param("scale", "-", 0.1, 2.5, 1.0, 0.1, "robot", "friction over the model's"),)
     identification = Identification(
-        nominal=True,
-        rank=22,
-        needs_ground=True,
-        levels=({"scale": -0.3}, {"scale": 0.3}),
-        excitation="squat",
+        nominal=True, rank=22, needs_ground=True, levels=({"scale": -0.3}, {"scale": 0.3}), excitation="squat"
     )
     fields = ("geom_friction",)
     scale: Tensor

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
 from go1exp.config.schema.registry import effect
 from go1exp.robot.actuators import ModelFields
 from go1exp.sim.effects.base import Effect, Param
 from go1exp.sim.effects.identification import TWO_ATTITUDES, TWO_GAIN_SETS, Identification
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 @effect("armature")
@@ -28,10 +25,7 @@ class Armature(Effect):
     title = "rotor inertia"
     params = (Param("added", "kg m2", -0.01, 0.05, 0.0, 0.001, "joint", "inertia about the joint's axis"),)
     identification = Identification(
-        nominal=True,
-        rank=3,
-        confounded=("kp_scale", "link_mass", "strength"),
-        separated_by=TWO_GAIN_SETS,
+        nominal=True, rank=3, confounded=("kp_scale", "link_mass", "strength"), separated_by=TWO_GAIN_SETS
     )
     fields = ("dof_armature",)
     added: Tensor
@@ -86,10 +80,7 @@ class LinkCom(Effect):
         Param("left", "m", -0.05, 0.05, 0.0, 0.002, "joint", "shift along the link's y axis"),
     )
     identification = Identification(
-        nominal=True,
-        rank=7,
-        confounded=("base_tilt", "encoder_offset"),
-        separated_by=TWO_ATTITUDES,
+        nominal=True, rank=7, confounded=("base_tilt", "encoder_offset"), separated_by=TWO_ATTITUDES
     )
     fields = ("body_ipos",)
     along: Tensor
@@ -172,11 +163,7 @@ class Payload(Effect):
         Param("z", "m", -0.2, 0.3, 0.1, math.inf, "robot", "up; 0.1 lies on top"),
     )
     identification = Identification(
-        nominal=True,
-        rank=20,
-        needs_ground=True,
-        free_shapes=("x", "y", "z"),
-        excitation="squat",
+        nominal=True, rank=20, needs_ground=True, free_shapes=("x", "y", "z"), excitation="squat"
     )
     fields = FIELDS
     order = 10  # after a shift of the trunk's own centre

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
+from go1exp.config.schema.joint_values import JointValues
 from go1exp.config.schema.registry import effect
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.actuator.motors import envelope
 from go1exp.sim.effects.base import Effect, Param
 from go1exp.sim.effects.identification import TWO_GAIN_SETS, Identification
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from go1exp.config.schema.joint_values import JointValues
 
 
 @effect("strength")

@@ -124,12 +124,7 @@ class Go1VectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     metadata = {"autoreset_mode": gym.vector.AutoresetMode.SAME_STEP}  # noqa: RUF012
 
     def __init__(
-        self,
-        num_envs: int = 1,
-        overrides: Sequence[str] = (),
-        *,
-        noise: bool = True,
-        action_box: float = ACTION_BOX,
+        self, num_envs: int = 1, overrides: Sequence[str] = (), *, noise: bool = True, action_box: float = ACTION_BOX
     ) -> None:
         self.core = make(overrides, num_envs, noise=noise)
         self.num_envs = num_envs

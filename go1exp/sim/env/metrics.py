@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
 from go1exp import robot
 from go1exp.base.tensors.memory import Memory
@@ -17,8 +18,6 @@ from go1exp.mdp.feet import impossible
 from go1exp.mdp.measures.gait import GAITS
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from go1exp.mdp.types import Snapshot
 
 

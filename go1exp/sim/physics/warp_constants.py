@@ -34,11 +34,7 @@ def _velocity(
 
 @wp.func
 def _centre(
-    row: int,
-    body: int,
-    xpos: wp.array[wp.vec3],
-    xmat: wp.array[wp.mat33],
-    ipos: wp.array2d[wp.vec3],
+    row: int, body: int, xpos: wp.array[wp.vec3], xmat: wp.array[wp.mat33], ipos: wp.array2d[wp.vec3]
 ) -> wp.vec3:
     """Centre of mass of a body in the world."""
     return xpos[body] + xmat[body] * ipos[row % ipos.shape[0], body]

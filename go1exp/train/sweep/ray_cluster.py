@@ -75,9 +75,7 @@ class Ray:
         try:
             self._connect()
             run = ray.remote(
-                num_cpus=self.settings.cpus,
-                num_gpus=self.settings.gpus,
-                max_retries=self.settings.retries,
+                num_cpus=self.settings.cpus, num_gpus=self.settings.gpus, max_retries=self.settings.retries
             )(command.run)
             references = {run.remote(task.command): task for task in tasks}
             try:
