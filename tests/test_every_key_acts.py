@@ -63,7 +63,7 @@ from go1exp.robot.messages import LowCmd
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu
 from go1exp.sim.task import MANY_TERMS, ONE_TERM, TrainConfig, parse_parts, parse_train
-from go1exp.train import policy, run_folder, trainer, wandb_writer
+from go1exp.train import metrics, policy, run_folder, trainer
 from tests.lockstep import lockstep
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `render_mode` attribute is not defined")
@@ -821,7 +821,7 @@ def stand_ins() -> Iterator[tuple[list[str], list[Any]]]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("stable_baselines3.common.base_class.get_device", get_device)
         patch.setitem(sys.modules, "wandb", wandb_stub(told))
-        patch.setattr(wandb_writer, "_bundle", lambda run: None)  # tests/test_logging.py has what packs it
+        patch.setattr(metrics, "_bundle", lambda run: None)  # tests/test_logging.py has what packs it
         torch.set_num_threads(1)
         try:
             yield asked, told

@@ -19,7 +19,7 @@ from go1exp.deploy.runtime.policy import PolicyMemory
 from go1exp.evaluate.agents import PolicyAgent
 from go1exp.mdp.types import TermSetup
 from go1exp.sim.env.core import Go1Core
-from go1exp.sim.env.frames import Frames
+from go1exp.sim.env.terms import Frames
 from go1exp.sim.task import TaskConfig
 from go1exp.train.ppo import GaussianPolicy
 

@@ -26,7 +26,7 @@ FILE = '''
 import math
 
 from go1exp.sim.effects.base import Effect, Param
-from go1exp.sim.effects.identification import Identification
+from go1exp.sim.effects.base import Identification
 from go1exp.config.schema.registry import effect
 
 
@@ -115,7 +115,7 @@ def test_a_new_effect_that_needs_ground_is_left_out_where_the_trunk_is_held() ->
 
 
 def test_the_workflow_knows_no_effect_by_its_name() -> None:
-    """What it must know of one is in the effect's own file (``go1exp/sim/effects/identification.py``)."""
+    """What it must know of one is in the effect's own file (``go1exp/sim/effects/base.py``)."""
     package = data_root() / "go1exp"
     sources = [*sorted((package / "gap").rglob("*.py")), package / "cli/gap.py"]
     assert len(sources) > 20

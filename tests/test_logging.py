@@ -20,7 +20,7 @@ from stable_baselines3.common import logger as sb3_logger
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import Expected
 from go1exp.sim.task import LoggerConfig, WandbConfig, parse_train
-from go1exp.train import metrics, wandb_writer
+from go1exp.train import metrics
 from go1exp.train.metrics import CsvWriter, make_logger
 from tests import small_run
 from tests.small_run import small
@@ -298,7 +298,7 @@ def test_an_offline_run_holds_name_group_tags_notes_config_videos_evaluations_an
     for name in ("checkpoints/000002.pt", "best.pt", "best.json", "config.yaml", "bundle.zip", "video.mp4"):
         (run / name).write_bytes(name.encode())
     (run / "evals.csv").write_text("iteration,steps,score\n1,64,0.5\n2,128,0.25\n")
-    monkeypatch.setattr(wandb_writer, "_bundle", lambda folder: folder / "bundle.zip")
+    monkeypatch.setattr(metrics, "_bundle", lambda folder: folder / "bundle.zip")
     config = replace(OFFLINE, group=None, tags=("trot", "ablation"), notes="why", artifacts=True)
     settings = {"seed": 7, "reward": {"gait": {"weight": 10.0}}}
     logger = make_logger(LoggerConfig(csv=False, tensorboard=False, wandb=config), run, 0, settings)
@@ -351,7 +351,7 @@ def test_variables_of_the_environment_go_before_the_settings(
     assert (about.run_id, about.project, about.run_group) == ("abcd1234", "theirs", "g")
     assert (about.display_name, about.notes, set(about.tags)) == ("n", "why", {"a", "b"})
     monkeypatch.setenv("WANDB_MODE", "online")
-    assert wandb_writer.mode(OFFLINE) == "online"
+    assert metrics.wandb_mode(OFFLINE) == "online"
 
 
 def test_the_tables_of_a_report_are_logged(tmp_path: Path, no_account: None) -> None:
@@ -370,7 +370,7 @@ def test_the_tables_of_a_report_are_logged(tmp_path: Path, no_account: None) -> 
 
 
 def test_without_a_bundle_there_is_a_line_that_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert wandb_writer._bundle(tmp_path / "none") is None
+    assert metrics._bundle(tmp_path / "none") is None
     assert "no bundle for Weights & Biases: go1exp export: run" in capsys.readouterr().out
 
 

@@ -24,8 +24,7 @@ from go1exp.config.schema.registry import ConfigError
 from go1exp.train import run_state
 from go1exp.train.sweep import index
 from go1exp.train.sweep.command import Command, Running, Task, run
-from go1exp.train.sweep.launchers import LAUNCHERS, chosen
-from go1exp.train.sweep.local import shares
+from go1exp.train.sweep.launchers import LAUNCHERS, chosen, shares
 from go1exp.train.sweep.slurm import Slurm
 from go1exp.train.sweep.tune import Range, _rows
 

@@ -24,7 +24,7 @@ from go1exp.cli.tune import _ranges
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError
 from go1exp.sim.task import parse_train
-from go1exp.train import run_state, wandb_writer
+from go1exp.train import metrics, run_state
 from go1exp.train.sweep import trials
 from go1exp.train.sweep.command import Ended
 from go1exp.train.sweep.tune import Range, Search, TuneSettings
@@ -55,7 +55,7 @@ def test_the_agent_of_weights_and_biases_gets_a_command_that_composes(monkeypatc
     config = parse_train(container)
     assert (config.ppo.learning_rate, config.ppo.minibatches) == (0.0007, 8)
     assert config.logger.wandb is not None
-    assert wandb_writer.mode(config.logger.wandb) == "online"  # what is offline, the search never sees
+    assert metrics.wandb_mode(config.logger.wandb) == "online"  # what is offline, the search never sees
     assert {*sweep["parameters"]} == {*given}
 
 

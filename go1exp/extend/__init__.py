@@ -42,9 +42,8 @@ from go1exp.mdp.measures.trace import NotMeasured, Trace
 from go1exp.mdp.mirror import Mirror
 from go1exp.mdp.types import Snapshot, TermSetup
 from go1exp.robot.actuators import ActuatorSetup, ModelFields
-from go1exp.sim.actuator.setup import Gains
-from go1exp.sim.effects.base import Effect, Gears, Measured, Param
-from go1exp.sim.effects.identification import Identification
+from go1exp.sim.actuator.motors import Gains
+from go1exp.sim.effects.base import Effect, Gears, Identification, Measured, Param
 
 __all__ = [
     "ActuatorSetup",

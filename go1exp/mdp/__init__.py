@@ -3,7 +3,7 @@
 Importing the package registers every term, from this explicit list.
 """
 
-from go1exp.mdp import commands, curricula, events, observations, randomizations, rewards, rewards_literal, terminations
+from go1exp.mdp import commands, curricula, events, observations, randomizations, rewards, rewards_literal
 
 __all__ = [
     "commands",
@@ -13,5 +13,4 @@ __all__ = [
     "randomizations",
     "rewards",
     "rewards_literal",
-    "terminations",
 ]

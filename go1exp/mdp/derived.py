@@ -1,16 +1,19 @@
-"""Quantities that follow from a Snapshot."""
+"""Quantities that follow from a Snapshot, and what an action means: joint targets about the nominal stance."""
 
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
 from go1exp import robot
 from go1exp.base.tensors.memory import constant_like
 from go1exp.base.tensors.rotation import rotate
 from go1exp.mdp.types import Snapshot
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 NOMINAL_STANCE = tuple(robot.NOMINAL_STANCE.tolist())
 
@@ -65,3 +68,20 @@ def since_last_contact_began(s: Snapshot) -> Tensor:
 def clock_angle(s: Snapshot, rate: float) -> Tensor:
     """(N,) angle of a gait clock that makes ``rate`` turns a second from the start of the episode, rad."""
     return 2.0 * math.pi * (rate * s.episode_time).frac()
+
+
+def clipped(action: Tensor, clip: float) -> Tensor:
+    """Cut a policy's output (N, 12) at +-``clip``: the action in force, which the policy observes as its last one."""
+    return action.clamp(-clip, clip)
+
+
+def of_shape(action: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """Return ``action``; raise ValueError where it has not one row for each robot: torch would spread it out."""
+    if tuple(action.shape) != tuple(shape):
+        raise ValueError(f"action has shape {tuple(action.shape)}; needed is {tuple(shape)}, one row for each robot")
+    return action
+
+
+def joint_target(action: Tensor, nominal: Tensor, scale: float) -> Tensor:
+    """Return position targets (N, 12), rad: nominal stance (12,) + ``scale`` (rad) x clipped action (N, 12)."""
+    return nominal + scale * action

@@ -1,14 +1,25 @@
-"""Things that happen to the robot during an episode: a class called once a policy step on the live state."""
+"""What happens to the robot during an episode, and what ends it in failure.
+
+An event is a class called once a policy step on the live state. A termination takes a Snapshot and returns ``(N,)``
+bool. The time limit is none: it truncates, and belongs to ``sim.episode_s``.
+"""
 
 from __future__ import annotations
 
+import math
+from typing import TYPE_CHECKING, Annotated
+
 import torch
-from torch import Tensor
+from pydantic import Field
 
 from go1exp.base.tensors.memory import Memory
 from go1exp.base.tensors.randomness import Stream
-from go1exp.config.schema.registry import PositiveRange, SpeedRange, event
+from go1exp.config.schema.registry import PositiveRange, SpeedRange, event, termination
 from go1exp.mdp.kinematics import KinematicState
+from go1exp.mdp.types import Snapshot
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @event("push")
@@ -36,3 +47,16 @@ class Push(Memory):
         live.copy_(torch.where(due.unsqueeze(1), velocity.to(live.dtype), live))
         wait = self._stream.uniform(1, low=self._interval[0], high=self._interval[1]).squeeze(1)
         self.time_left.copy_(torch.where(due | restart, wait, self.time_left))
+
+
+@termination("trunk_contact")
+def trunk_contact(s: Snapshot) -> Tensor:
+    """Trunk, head or a hip touched the ground during this policy step."""
+    assert s.trunk_contact is not None
+    return s.trunk_contact
+
+
+@termination("tilt")
+def tilt(s: Snapshot, *, max_angle: Annotated[float, Field(gt=0, lt=math.pi)] = 1.2) -> Tensor:
+    """The trunk's z axis is more than ``max_angle`` rad off the vertical."""
+    return s.projected_gravity_b[:, 2] > -torch.cos(torch.as_tensor(max_angle))

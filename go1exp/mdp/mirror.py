@@ -9,13 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
 from go1exp import robot
 from go1exp.base.tensors.memory import constant, constant_like
 from go1exp.config.schema.registry import Term
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,7 @@ JOINTS = Mirror(robot.MIRROR_JOINTS, robot.MIRROR_JOINT_SIGNS)
 """Of each joint its angle, speed, acceleration, torque or target; also about the nominal stance, which is symmetric."""
 
 ACTION = JOINTS
-"""The policy's output: ``mdp/actions.py`` adds it, times one scale, to the nominal stance."""
+"""The policy's output: ``mdp/derived.py`` adds it, times one scale, to the nominal stance."""
 
 LEGS = Mirror(robot.MIRROR_LEGS, (1.0,) * robot.NUM_LEGS)
 """One number of each leg without direction: the foot's force, height or contact."""

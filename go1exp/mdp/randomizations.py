@@ -7,20 +7,53 @@ write the state of a reset. All draws are independent per element. Table I of th
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import functools
+from typing import TYPE_CHECKING, Annotated, Literal
 
+import numpy as np
 import torch
 from pydantic import AfterValidator, Field
-from torch import Tensor
 
 from go1exp import robot
 from go1exp.base.tensors.memory import constant_like
 from go1exp.base.tensors.randomness import Stream
-from go1exp.base.tensors.restitution import damping_ratio
 from go1exp.base.tensors.rotation import quat_from_rotvec, quat_multiply
 from go1exp.config.schema.registry import PositiveRange, Range, SpeedRange, ordered, randomization
 from go1exp.mdp.kinematics import KinematicState
 from go1exp.robot.actuators import ModelFields
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+def restitution(damping_ratio: np.ndarray) -> np.ndarray:
+    """Return the share of its speed that a mass keeps when it meets a spring-damper which can push but not pull.
+
+    With z the damping ratio and w = sqrt(|1 - z^2|): e = exp(-z/w atan2(2 z w, 2 z^2 - 1)) below z = 1, exp(-2) at 1,
+    and exp(-z/w ln((z + w) / (z - w))) above.
+    Schwager and Poeschel, "Coefficient of restitution and linear-dashpot model revisited", Granular Matter 9 (2007).
+    """
+    z = np.asarray(damping_ratio, dtype=float)
+    w = np.sqrt(np.maximum(np.abs(1.0 - z**2), 1e-18))
+    under = np.where(z < 1.0, np.arctan2(2.0 * z * w, 2.0 * z**2 - 1.0), 0.0)
+    over = np.log((z + w) / np.maximum(z - w, 1e-18))
+    return np.exp(-z / w * np.where(z < 1.0, under, over))
+
+
+@functools.cache
+def _restitution_table(device: torch.device) -> tuple[Tensor, Tensor]:
+    """Damping ratios and their restitution on a grid, restitution rising."""
+    ratio = np.geomspace(4.0, 0.1, 400)
+    return torch.tensor(restitution(ratio), device=device), torch.tensor(ratio, device=device)
+
+
+def damping_ratio(e: Tensor) -> Tensor:
+    """Invert ``restitution`` by linear interpolation; any shape, values from 0.015 to 0.74."""
+    known, ratio = _restitution_table(e.device)
+    right = torch.searchsorted(known, e.to(known.dtype).contiguous()).clamp(1, len(known) - 1)
+    share = (e - known[right - 1]) / (known[right] - known[right - 1])
+    return ratio[right - 1] + share * (ratio[right] - ratio[right - 1])
+
 
 JOINT_POS_LIMITS = tuple(tuple(bound) for bound in robot.JOINT_POS_LIMITS.T.tolist())
 """Lower and upper, rad."""

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import torch
-from torch import Tensor
 
 from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.config.schema.joint_values import JointValues, spread
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 class ModelFields(Protocol):

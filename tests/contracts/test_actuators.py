@@ -16,7 +16,7 @@ from go1exp import robot
 from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.config.schema.registry import members
 from go1exp.robot.actuators import ActuatorSetup
-from go1exp.sim.actuator.setup import Actuator
+from go1exp.sim.actuator.motors import Actuator
 from tests.rounding import alone_and_in_a_batch
 
 NEEDS: dict[str, Callable[[Path], dict[str, Any]]] = {

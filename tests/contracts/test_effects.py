@@ -28,8 +28,7 @@ from go1exp.config.schema.joint_values import JointValues, numbers, spread
 from go1exp.config.schema.physics import MUJOCO_CONTACT
 from go1exp.config.schema.registry import Entry, Term, bind, members
 from go1exp.robot.actuators import ActuatorSetup
-from go1exp.sim.effects.base import Effect, Measured, Param
-from go1exp.sim.effects.identification import LAST
+from go1exp.sim.effects.base import LAST, Effect, Measured, Param
 from go1exp.sim.effects.rules import on_mount
 from go1exp.sim.effects.stack import HOOKS
 from go1exp.sim.effects.tolerances import Tolerances

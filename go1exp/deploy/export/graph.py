@@ -22,7 +22,7 @@ from go1exp.base.tensors.rotation import projected_gravity
 from go1exp.config.schema.history import frame_width, frames_of, width
 from go1exp.config.schema.registry import Expected, Term
 from go1exp.deploy.runtime.metadata import Block, Port
-from go1exp.mdp.actions import clipped, joint_target
+from go1exp.mdp.derived import clipped, joint_target
 from go1exp.mdp.types import Snapshot
 from go1exp.sim.task import ActionConfig
 

@@ -21,7 +21,7 @@ from go1exp.evaluate.protocol.plan import Impulses, Kicker, heading
 from go1exp.evaluate.rollout import require_agreement
 from go1exp.evaluate.viewer import requests
 from go1exp.evaluate.viewer.requests import Ground, Setup, task_under
-from go1exp.mdp.actions import clipped
+from go1exp.mdp.derived import clipped
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TaskConfig
 

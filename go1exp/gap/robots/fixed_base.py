@@ -35,7 +35,7 @@ from go1exp.logs.audit.related import SPEED_CHECKS
 from go1exp.logs.recording import Recording, joint_channel, joint_channels
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.robot.config import RobotConfig
-from go1exp.sim.actuator.setup import Gains
+from go1exp.sim.actuator.motors import Gains
 from go1exp.sim.effects.tolerances import DECLARED, Tolerances
 from go1exp.sim.physics.fixed_base import FixedBaseError, build_fixed_base, feel_each_other
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu

@@ -14,7 +14,7 @@ from go1exp.gap.replay.rows import Key, Machine, Probe, Theta, variants
 from go1exp.gap.score.likelihood import Scorer, log_chi2
 from go1exp.gap.score.linear import Layout, Table, differences, predicted
 from go1exp.gap.search import thresholds, tolerances
-from go1exp.sim.effects.identification import Identification, Periodic
+from go1exp.sim.effects.base import Identification, Periodic
 from go1exp.sim.effects.tolerances import Tolerances, sizes
 
 
@@ -83,7 +83,7 @@ class Motion:
     demand: np.ndarray
 
     def angle(self, value: float) -> np.ndarray:
-        """Return what a shape's value stands for (J,) or (1,); see ``sim/effects/identification.py``."""
+        """Return what a shape's value stands for (J,) or (1,); see ``sim/effects/base.py``."""
         if math.isnan(value):
             return self.mean.copy()
         if math.isinf(value):

@@ -17,10 +17,9 @@ from go1exp.gap.replay.rows import Key, Machine, Probe, Theta
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import Layout, Table
 from go1exp.gap.search import thresholds
-from go1exp.sim.effects.base import Param
-from go1exp.sim.effects.identification import Identification
+from go1exp.sim.effects.base import Identification, Param
 from go1exp.sim.effects.tolerances import Tolerances, effect_class, sizes
-from go1exp.sim.physics import box
+from go1exp.sim.physics.dynamics import box_minimum
 
 
 def identification(effect: str) -> Identification:
@@ -213,7 +212,7 @@ def solve(matrix: np.ndarray, right: np.ndarray, limits: Bounds) -> np.ndarray:
     low, high = limits.low / scale, limits.high / scale
     x, moves = low.copy(), low < high
     slope = full[np.ix_(moves, ~moves)] @ x[~moves] - aim[moves]
-    x[moves] = box.minimum(full[np.ix_(moves, moves)], slope, low[moves], high[moves])
+    x[moves] = box_minimum(full[np.ix_(moves, moves)], slope, low[moves], high[moves])
     return np.asarray(x * scale)
 
 

@@ -10,10 +10,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from go1exp.config.schema.registry import Entry, Term, members
-from go1exp.mdp.measures import body, contact, gait
+from go1exp.mdp.measures import body, gait
 from go1exp.mdp.measures.trace import NotMeasured, Trace
 
-__all__ = ["NotMeasured", "Trace", "body", "contact", "gait", "measured"]
+__all__ = ["NotMeasured", "Trace", "body", "gait", "measured"]
 
 
 def every_measure() -> list[Term]:

@@ -1,13 +1,3 @@
 """Physical effects that a nominal model does not have. Importing the package registers every effect."""
 
-from go1exp.sim.effects import (  # noqa: F401
-    controller,
-    delays,
-    friction,
-    gears,
-    ground,
-    joints,
-    masses,
-    motors,
-    trunk,
-)
+from go1exp.sim.effects import controller, gears, ground, joints, masses, motors, trunk  # noqa: F401

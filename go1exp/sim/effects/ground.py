@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
 from go1exp import robot
 from go1exp.config.schema.physics import ContactConfig
 from go1exp.config.schema.registry import effect
 from go1exp.robot.actuators import ModelFields
-from go1exp.sim.effects.base import Effect, Param
-from go1exp.sim.effects.identification import Identification
+from go1exp.sim.effects.base import Effect, Identification, Param
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @effect("foot_friction")

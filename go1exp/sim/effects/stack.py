@@ -11,7 +11,7 @@ from torch import Tensor
 from go1exp.config.schema.joint_values import spread
 from go1exp.config.schema.registry import Term
 from go1exp.robot.actuators import ActuatorSetup, CompiledModel, ModelFields
-from go1exp.sim.actuator.setup import Actuator, HasGains
+from go1exp.sim.actuator.motors import Actuator, HasGains
 from go1exp.sim.effects.base import Effect, Gears, Measured
 from go1exp.sim.effects.gears import TwoMass
 

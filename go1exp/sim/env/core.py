@@ -19,9 +19,9 @@ from go1exp import robot
 from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.base.tensors.rotation import projected_gravity, rotate_inverse
 from go1exp.config.schema.training import Value
-from go1exp.mdp.actions import clipped, joint_target, of_shape
 from go1exp.mdp.commands import UniformVelocity, WideningVelocity
 from go1exp.mdp.curricula import TrackedPath
+from go1exp.mdp.derived import clipped, joint_target, of_shape
 from go1exp.mdp.feet import Feet
 from go1exp.mdp.ground import GroundHeight, HeightScan
 from go1exp.mdp.kinematics import KinematicState, lift

@@ -25,7 +25,7 @@ from go1exp.config.schema.registry import ConfigError, Term
 from go1exp.mdp.types import Snapshot
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.robot.config import RobotConfig
-from go1exp.sim.actuator.setup import Actuator, TakesFeedforward, takes_feedforward
+from go1exp.sim.actuator.motors import Actuator, TakesFeedforward, takes_feedforward
 from go1exp.sim.effects.base import Measured
 from go1exp.sim.effects.stack import EffectStack
 from go1exp.sim.physics.backend import PhysicsBackend

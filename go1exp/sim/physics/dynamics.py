@@ -1,4 +1,4 @@
-"""Kinematics and inverse dynamics of one robot, by MuJoCo."""
+"""Kinematics and inverse dynamics of one robot, and quadratic programs within bounds, by MuJoCo."""
 
 from __future__ import annotations
 
@@ -167,3 +167,22 @@ class Kinematics:
         mujoco.mj_fullM(model, data, full)
         c = self.com - data.qpos[:3]
         return np.asarray(full[3:6, 3:6] - self.mass * (c @ c * np.eye(3) - np.outer(c, c)))
+
+
+def box_minimum(matrix: np.ndarray, slope: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the minimum (n,) of x' A x / 2 + slope' x within bounds (``mju_boxQP``, a projected Newton method).
+
+    Args:
+        matrix: A (n, n), positive definite.
+        slope: at x = 0 (n,).
+        low: bounds (n,), below ``high`` each.
+        high: bounds (n,).
+
+    Raises:
+        LinAlgError: if there is none.
+    """
+    size = len(slope)
+    x, factor, free = np.zeros(size).clip(low, high), np.zeros((size, size + 7)), np.zeros(size, dtype=np.int32)
+    if size and mujoco.mju_boxQP(x, factor, free, matrix, slope, low, high) < 0:
+        raise np.linalg.LinAlgError("MuJoCo found no minimum within bounds")
+    return x

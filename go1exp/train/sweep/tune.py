@@ -28,7 +28,7 @@ from go1exp.config.schema.settings import settings
 from go1exp.config.schema.training import EVALUATED, ROWS
 from go1exp.train.sweep import index, trials
 from go1exp.train.sweep.command import CORES, PARENT, Command, Ended, Running
-from go1exp.train.sweep.local import shares
+from go1exp.train.sweep.launchers import shares
 from go1exp.train.sweep.trials import FOLDER, LOOK_S
 
 
