@@ -29,17 +29,13 @@ from go1exp.robot.config import RobotConfig
 Progress = Callable[[str, float], None]
 """Called with what is being done, and which share of all is finished."""
 
-FEWEST_WINDOWS = 8
-"""Windows below which nothing is tested."""
-
-FEWEST_RECORDINGS = 3
-"""Recordings that must remain if others are left out."""
+FEWEST_WINDOWS = 8  # windows below which nothing is tested
+FEWEST_RECORDINGS = 3  # recordings that must remain if others are left out
 
 FEWEST_STRETCHES = 8
 """Stretches of held-out windows below which no sign-flip test of two clocks comes to p < 0.01: 2 / 2^8."""
 
-USABLE = 0.5
-"""Share of the windows that must be without holes by a clock for it to compete."""
+USABLE = 0.5  # share of the windows that must be without holes by a clock for it to compete
 
 
 class NotComparable(Expected):

@@ -63,8 +63,7 @@ def small(angle: float) -> float:
     return angle
 
 
-LARGEST = 1.0
-"""Largest error of an angle that can be accepted, rad."""
+LARGEST = 1.0  # largest error of an angle that can be accepted, rad
 
 Angle = Annotated[float, BeforeValidator(in_rad), AfterValidator(small)]
 

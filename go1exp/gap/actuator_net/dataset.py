@@ -280,8 +280,7 @@ def fingerprint(recording: Recording) -> str:
 
 # ---------------------------------------------------------------------- smooth motion, for inverse dynamics
 
-ORDER = 3
-"""Order of the polynomial: the lowest whose second derivative may change within the window."""
+ORDER = 3  # order of the polynomial: the lowest whose second derivative may change within the window
 
 WINDOW = 0.06
 """s; passes motion to about 20 Hz (half amplitude at 1.2 / window for this order) and removes noise above (chosen)."""

@@ -16,8 +16,7 @@ from go1exp.gap.actuator_net.report import rmse
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-STRETCH = 1.0
-"""Duration of a plot, s (chosen: a few strides, with fast transients still visible)."""
+STRETCH = 1.0  # duration of a plot, s (chosen: a few strides, with fast transients still visible)
 
 MEASURED, NET, REFERENCE = "0.35", COLOURS[1], COLOURS[0]
 

@@ -18,8 +18,7 @@ high."""
 QUANTILE = 0.99
 """The scales are this quantile of |speed| and |torque| over all recordings, so that rare spikes have no effect."""
 
-REVERSAL = 0.02
-"""s; rows this close to a change of the velocity's sign count as reversal."""
+REVERSAL = 0.02  # s; rows this close to a change of the velocity's sign count as reversal
 
 REGIMES = ("all", "still", "slow", "fast", "reversal", "high torque")
 
@@ -205,8 +204,7 @@ def report(
     return Report(target, split, tuple(cells), tuple(by_episode), missing, tuple(limits))
 
 
-WORTH = 0.95
-"""Share of the error of zero, PD law and linear map below which a net is worth more (chosen)."""
+WORTH = 0.95  # share of the error of zero, PD law and linear map below which a net is worth more (chosen)
 
 
 def useless(report: Report) -> list[str]:

@@ -15,18 +15,15 @@ from go1exp.logs.recording import Recording, RecordingError
 FIT_S = 0.014
 """Half width of the smoothing that gives a window's initial state, s, where samples are not too far apart for it."""
 
-FIT_SAMPLES = 2.2
-"""Least half width of that smoothing in samples."""
+FIT_SAMPLES = 2.2  # least half width of that smoothing in samples
 
 START_SD = (1.0e-3, 0.1)
 """Least uncertainty of a window's initial state, rad and rad/s (chosen: several times what smoothing leaves)."""
 
-GAP = 2.5
-"""A step of the clock beyond this many periods is a hole that no window may have."""
+GAP = 2.5  # a step of the clock beyond this many periods is a hole that no window may have
 
 QUANTITIES = ("q", "qd", "tau_est")
-THIRD = 20.0
-"""Variance of the third difference of unit white noise: 1 + 9 + 9 + 1."""
+THIRD = 20.0  # variance of the third difference of unit white noise: 1 + 9 + 9 + 1
 
 BLOCK_QUANTILE = 0.907
 """30 % quantile of the root mean square of 50 third differences of white noise over its expectation (20000 draws)."""

@@ -18,20 +18,11 @@ from go1exp.gap.result import GapResult, GapSettings
 from go1exp.logs.recording import Recording
 from go1exp.sim.effects.tolerances import Tolerances
 
-SMOOTH = 5
-"""Samples of the parabola whose slope is the speed where none was recorded, or none that can be trusted."""
-
-CLOCK_SPEED = 0.5
-"""Speed, rad/s, from which a moving joint tells the time."""
-
-CLOCK_ROWS = 401
-"""Rows around a step over which the clock hardly changes its rate."""
-
-MOST_WINDOWS = 360
-"""Windows beyond which more would only cost time; they are then spread over all recordings."""
-
-MOST_STEPS = 250_000
-"""The same as physics steps of all windows, times joints of a group: some minutes of work."""
+SMOOTH = 5  # samples of the parabola whose slope is the speed where none was recorded, or none that can be trusted
+CLOCK_SPEED = 0.5  # speed, rad/s, from which a moving joint tells the time
+CLOCK_ROWS = 401  # rows around a step over which the clock hardly changes its rate
+MOST_WINDOWS = 360  # windows beyond which more would only cost time; they are then spread over all recordings
+MOST_STEPS = 250_000  # the same as physics steps of all windows, times joints of a group: some minutes of work
 
 HINT = "give the robot of the logs: model=NAME or model=FILE.yaml (go1exp list model, docs/own_robot.md)"
 """What to do where logs are of another robot than the model."""
@@ -108,8 +99,7 @@ def spaced(recordings: Sequence[Recording], settings: GapSettings, joints: int) 
     return dataclasses.replace(settings, stride_s=stride), [warning]
 
 
-SHOWN = 3
-"""Recordings of one contact that a message lists."""
+SHOWN = 3  # recordings of one contact that a message lists
 
 CHOOSE = "contact=stiff (conf/contact, docs/contact.md)"
 """How one is chosen."""

@@ -24,8 +24,7 @@ LOADED = 10.0
 """Force from which a foot carries weight, N: a third of what each bears at rest, twice what is
 estimated for a foot in the air."""
 
-AGREE = 0.004
-"""Feet that carry weight and disagree by more about the height of the base, m, are not all on the ground."""
+AGREE = 0.004  # feet that carry weight and disagree by more about the height of the base, m, are not all on the ground
 
 TORN = 0.3
 """Disagreement about its velocity beyond which nothing is known of it, m/s: a foot is just touching down or leaving."""
@@ -34,8 +33,7 @@ SLIDE = 0.05
 """Feet that carry weight and disagree by this about the velocity of the base, m/s, put an estimate in doubt as a misfit
 of one standard deviation does: one of them slides, or has just touched down."""
 
-SINK = 3.0e-5
-"""How far a foot sinks into the ground, m/N (measured in the model at rest)."""
+SINK = 3.0e-5  # how far a foot sinks into the ground, m/N (measured in the model at rest)
 
 
 @dataclass(frozen=True)
@@ -123,8 +121,7 @@ WINDOW_S, BURN_S, STRIDE_S = 0.2, 0.03, 0.3
 """Longest windows, what is replayed before them, and from one to the next, s (chosen: what is not known of the
 initial state grows so fast over impacts that longer ones tell less)."""
 
-MOST_WINDOWS = 96
-"""Windows beyond which more would only cost time."""
+MOST_WINDOWS = 96  # windows beyond which more would only cost time
 
 BASE_SD = (0.0015, 0.003, 0.003, 0.02, 0.02, 0.02, 0.02, 0.02, 0.02)
 """Standard deviations of the base's initial state: height m, roll and pitch rad, velocity m/s, rate rad/s (chosen: some

@@ -25,29 +25,20 @@ from go1exp.logs.recording import Recording, RecordingError
 from go1exp.robot.config import RobotConfig
 from go1exp.sim.physics.dynamics import LegDynamics, Legs
 
-LONGEST_S, BURN_S = 0.25, 0.02
-"""Longest windows, and what is replayed before them, s: a swing of a trot takes 0.2 s."""
-
-SHORTEST_S = 0.05
-"""Shortest time of a swing that is compared, s."""
+LONGEST_S, BURN_S = 0.25, 0.02  # longest windows, and what is replayed before them, s: a swing of a trot takes 0.2 s
+SHORTEST_S = 0.05  # shortest time of a swing that is compared, s
 
 AFTER_S, BEFORE_S = 0.006, 0.01
 """Time after lift-off, beside the half width of the smoothing, and before touch-down that is left out, s."""
 
-SOONER_S = 0.016
-"""Span in which a window begins where its initial state is known best, s."""
-
-MOST_WINDOWS = 120
-"""Windows beyond which more would only cost time."""
-
-MOTION_S = 0.006
-"""Half width of the smoothing of the trunk's motion, s (chosen)."""
+SOONER_S = 0.016  # span in which a window begins where its initial state is known best, s
+MOST_WINDOWS = 120  # windows beyond which more would only cost time
+MOTION_S = 0.006  # half width of the smoothing of the trunk's motion, s (chosen)
 
 NOISE_ROWS, NOISE_PIECES = 54, 6
 """Rows of a swing, and swings of a leg, from which the noise of its encoders can be read."""
 
-AROUND_S = 0.01
-"""Time before and after a window for which its trunk's motion is kept, s."""
+AROUND_S = 0.01  # time before and after a window for which its trunk's motion is kept, s
 
 
 @dataclass(frozen=True)

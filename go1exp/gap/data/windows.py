@@ -152,11 +152,8 @@ def held(changes: tuple[np.ndarray, np.ndarray], times: np.ndarray) -> np.ndarra
     return np.asarray(changes[1][index.clip(0)])
 
 
-STRETCH = 3
-"""Windows of a stretch."""
-
-KEPT_EVERY = 5
-"""Of this many stretches of an episode one is kept for the last check, where whole episodes cannot be."""
+STRETCH = 3  # windows of a stretch
+KEPT_EVERY = 5  # of this many stretches of an episode one is kept for the last check, where whole episodes cannot be
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,7 @@ from go1exp.gap.score.linear import Layout, Table, predicted
 from go1exp.gap.search import tolerances
 from go1exp.gap.search.state import State
 
-FITTED = 24
-"""Windows of the recordings at hand on which rivals are fitted and compared, at most."""
+FITTED = 24  # windows of the recordings at hand on which rivals are fitted and compared, at most
 
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(5)
 """Of a mean over a normal distribution (Gauss and Hermite)."""
@@ -181,17 +180,10 @@ def _measured(scorer: Scorer, theta: Theta, windows: np.ndarray, dt: float) -> S
     return dataclasses.replace(scorer, replayer=dataclasses.replace(replayer, windows=copied))
 
 
-ENOUGH = 0.8
-"""Power from which two explanations count as distinguishable."""
-
-LOT = 20
-"""Designs whose windows are replayed together; more would need more memory."""
-
-FEW, MORE = 3, 8
-"""Windows of a design in the quick look, and in the closer one."""
-
-FINALISTS = 4
-"""Designs of the library that are looked at closely, and neighbours in a round."""
+ENOUGH = 0.8  # power from which two explanations count as distinguishable
+LOT = 20  # designs whose windows are replayed together; more would need more memory
+FEW, MORE = 3, 8  # windows of a design in the quick look, and in the closer one
+FINALISTS = 4  # designs of the library that are looked at closely, and neighbours in a round
 
 COARSE = 2.0
 """Physics step of all comparisons over that of the search: both sides have the same, and it takes half the time."""

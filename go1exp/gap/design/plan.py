@@ -177,11 +177,8 @@ MOTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
 )
 """Kinds of motion in the library."""
 
-SCALES = (1.0, 0.5)
-"""Sizes of motion in the library, as shares of what the excitation does by itself."""
-
-CARRIED = 0.3
-"""Highest frequency of a band over the rate of commands."""
+SCALES = (1.0, 0.5)  # sizes of motion in the library, as shares of what the excitation does by itself
+CARRIED = 0.3  # highest frequency of a band over the rate of commands
 
 
 @dataclass(frozen=True)

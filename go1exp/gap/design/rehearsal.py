@@ -19,17 +19,13 @@ from go1exp.gap.score.likelihood import Scorer, scorer
 from go1exp.logs.excitations import Motion
 from go1exp.logs.recording import FLAG, Recording, RecordingError, joint_channels
 
-SETTLE_S = 0.5
-"""Time for which the first target is held before a design begins, s."""
-
-CLOCK = 0.01
-"""Relative error of a logger's clock up to which commands are sent at the rate that recordings say."""
+SETTLE_S = 0.5  # time for which the first target is held before a design begins, s
+CLOCK = 0.01  # relative error of a logger's clock up to which commands are sent at the rate that recordings say
 
 PLAYED = ("q", "qd", "tau_est")
 """What is kept of a rehearsal: angles, speeds, and the torque that the drives make."""
 
-FADE_S = 1.0
-"""Time at the beginning of a motion that is not evaluated, s: motions grow from rest."""
+FADE_S = 1.0  # time at the beginning of a motion that is not evaluated, s: motions grow from rest
 
 
 @dataclass(frozen=True)

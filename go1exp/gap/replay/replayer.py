@@ -19,8 +19,7 @@ from go1exp.sim.effects.base import Measured
 from go1exp.sim.env.plant import FRICTION, Plant
 from go1exp.sim.physics.backend import PhysicsBackend
 
-LEVEL = (1.0, 0.0, 0.0, 0.0)
-"""Attitude of a trunk that is held level, w-x-y-z."""
+LEVEL = (1.0, 0.0, 0.0, 0.0)  # attitude of a trunk that is held level, w-x-y-z
 
 
 @dataclass

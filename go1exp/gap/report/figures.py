@@ -21,17 +21,10 @@ if TYPE_CHECKING:
 
 BEFORE, AFTER, MEASURED = COLOURS[1], COLOURS[0], "#333333"
 
-SHOWN_JOINTS = 3
-"""Joints of a window that are drawn: those with the largest error of the nominal model."""
-
-POINTS = 500
-"""Most samples of a curve that are drawn."""
-
-LINEAR = 3.0
-"""Error up to which its scale is linear, in standard deviations of the noise; logarithmic beyond."""
-
-LEAST = 1e-2
-"""Smallest normalised chi2 of a logarithmic axis."""
+SHOWN_JOINTS = 3  # joints of a window that are drawn: those with the largest error of the nominal model
+POINTS = 500  # most samples of a curve that are drawn
+LINEAR = 3.0  # error up to which its scale is linear, in standard deviations of the noise; logarithmic beyond
+LEAST = 1e-2  # smallest normalised chi2 of a logarithmic axis
 
 
 # ---------------------------------------------------------------------- windows

@@ -18,11 +18,8 @@ from go1exp.gap.report.tables import short
 from go1exp.gap.result import GapResult, Localisation, NamedEffect
 from go1exp.gap.search import clocks
 
-MOST_WINDOWS = 6
-"""Windows that are drawn, so that the page stays small; the JSON file has all."""
-
-MOST_FORESTS = 16
-"""Parameters that are drawn; the table has all."""
+MOST_WINDOWS = 6  # windows that are drawn, so that the page stays small; the JSON file has all
+MOST_FORESTS = 16  # parameters that are drawn; the table has all
 
 
 def write_report(result: GapResult, folder: Path) -> list[Path]:
@@ -216,8 +213,7 @@ def _provenance(result: GapResult) -> list[Section]:
 
 WIDTH = 100
 
-MOST_EPISODES = 6
-"""Listed episodes, those with the largest residual; the page has all."""
+MOST_EPISODES = 6  # listed episodes, those with the largest residual; the page has all
 
 
 def text(result: GapResult, status: int | None = None) -> str:

@@ -16,14 +16,12 @@ from go1exp.config.schema.physics import contact_text
 from go1exp.gap.data.prepare import tolerances_of
 from go1exp.gap.result import Candidate, GapResult, Localisation
 
-SMALLEST = 0.1
-"""Normalised chi2 - 1 below which the colour of a heat map is the lightest."""
+SMALLEST = 0.1  # normalised chi2 - 1 below which the colour of a heat map is the lightest
 
 PAINT = {"excess": "YlOrBr", "fall": "PuOr"}
 """Colour maps: of falling brightness, and diverging; both are safe for the colour-blind."""
 
-LONGEST = 4
-"""Most values that a row of the evidence lists; the JSON file has all."""
+LONGEST = 4  # most values that a row of the evidence lists; the JSON file has all
 
 
 # ---------------------------------------------------------------------- heat maps

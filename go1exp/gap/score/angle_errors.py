@@ -102,20 +102,11 @@ REGIMES = (
 ON_FEET = ("stance", "swing", "impact")
 """Regimes of a standing robot, beside the others."""
 
-IMPACT_S = 0.03
-"""Time after a foot begins to carry weight that counts as impact, s."""
-
-AT_REST, SLOW, FAST = 0.1, 1.0, 5.0
-"""Speeds up to which a joint rests or is slow, and from which it is fast, rad/s."""
-
-TURN_S = 0.02
-"""Time about a change of direction, s."""
-
-EDGE = 0.05
-"""Jump of a target that counts as an edge, rad; what follows within 60 ms is its answer."""
-
-HIGH = 0.6
-"""Share of the largest demanded torque from which torque is high."""
+IMPACT_S = 0.03  # time after a foot begins to carry weight that counts as impact, s
+AT_REST, SLOW, FAST = 0.1, 1.0, 5.0  # speeds up to which a joint rests or is slow, and from which it is fast, rad/s
+TURN_S = 0.02  # time about a change of direction, s
+EDGE = 0.05  # jump of a target that counts as an edge, rad; what follows within 60 ms is its answer
+HIGH = 0.6  # share of the largest demanded torque from which torque is high
 
 SHUFFLES = 300
 FALSE_DISCOVERIES = 0.05

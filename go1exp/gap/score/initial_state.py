@@ -21,20 +21,11 @@ from go1exp.gap.replay.rows import Rows, Theta, variants
 from go1exp.gap.score.likelihood import Scorer, grouped, log_chi2, scorer
 from go1exp.logs.recording import Recording
 
-ROUNDS = 6
-"""Times that states are moved at most; most have settled after two."""
-
-LENGTHS = (1.0, 0.4)
-"""Shares of a step to the best state that are tried."""
-
-FARTHEST = 4.0
-"""Longest step of a coordinate, in standard deviations."""
-
-GAIN = 0.05
-"""Fall of a window's log chi2 in a round below which it needs no more rounds."""
-
-DRAWS = 4
-"""States drawn from what remains uncertain."""
+ROUNDS = 6  # times that states are moved at most; most have settled after two
+LENGTHS = (1.0, 0.4)  # shares of a step to the best state that are tried
+FARTHEST = 4.0  # longest step of a coordinate, in standard deviations
+GAIN = 0.05  # fall of a window's log chi2 in a round below which it needs no more rounds
+DRAWS = 4  # states drawn from what remains uncertain
 
 
 def solved(state: np.ndarray, residual: np.ndarray, off: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

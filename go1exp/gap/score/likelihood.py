@@ -54,8 +54,7 @@ def removed(before: float, after: float) -> float:
     return 1.0 - max(after, 0.0) / before if before > 0 else 0.0
 
 
-STATE_PROBE = (1.0e-3, 0.05)
-"""Change of an initial angle, rad, and speed, rad/s, by which its influence is measured."""
+STATE_PROBE = (1.0e-3, 0.05)  # change of an initial angle, rad, and speed, rad/s, by which its influence is measured
 
 
 def grouped(machine: Machine, y: np.ndarray) -> np.ndarray:

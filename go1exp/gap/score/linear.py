@@ -101,8 +101,7 @@ JUMPS = 0.03
 """Share of a window's columns, in units of tolerances, that may be errors. Beyond it something jumps there, such as a
 stop that is met a step later."""
 
-KEPT = 0.2
-"""Share of a column's signal that windows without jumps must hold for those with jumps to be left out."""
+KEPT = 0.2  # share of a column's signal that windows without jumps must hold for those with jumps to be left out
 
 
 def unbiased_grams(scorer: Scorer, one: Table, other: Table, unit: np.ndarray, needed: np.ndarray) -> np.ndarray:

@@ -28,11 +28,8 @@ from go1exp.gap.search.state import Search, begun
 from go1exp.gap.search.stepwise import run
 from go1exp.logs.recording import Recording, RecordingError
 
-TRIES = 9
-"""Rows at which a window may begin: the one with the smoothest motion about it is taken."""
-
-SMOOTH_ROWS = 3
-"""Rows to both sides in which motion is looked at for that."""
+TRIES = 9  # rows at which a window may begin: the one with the smoothest motion about it is taken
+SMOOTH_ROWS = 3  # rows to both sides in which motion is looked at for that
 
 Key = TypeVar("Key", bound=str)
 Cut = Callable[[Sequence[Sequence[Place]]], Windows]

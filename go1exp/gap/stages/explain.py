@@ -30,8 +30,7 @@ from go1exp.logs.recording import Recording
 from go1exp.robot.config import RobotConfig
 from go1exp.sim.effects.tolerances import declared
 
-FEWEST_SWINGS = 24
-"""Windows of legs in the air below which nothing is tested: each shows some of the legs only."""
+FEWEST_SWINGS = 24  # windows of legs in the air below which nothing is tested: each shows some of the legs only
 
 SWING_ALONE = (
     "Only legs in the air were compared, so trunk, feet and ground were not tested; search.phase=whole compares all."

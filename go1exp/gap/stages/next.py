@@ -27,8 +27,7 @@ from go1exp.robot import JOINTS
 from go1exp.robot.config import RobotConfig
 from go1exp.sim.effects.tolerances import sizes
 
-WIDEST = 0.5
-"""Largest relative standard deviation of a size that is believed; an interval across null would have any."""
+WIDEST = 0.5  # largest relative standard deviation of a size that is believed; an interval across null would have any
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,7 @@ UNITS = {"q": "rad", "qd": "rad/s", "tau_est": "N m"}
 TURN, SPEED = ("roll", "pitch", "yaw"), ("base_lin_vel_x_b", "base_lin_vel_y_b", "base_lin_vel_z_b")
 TRUNK_CHANNELS = {"imu_gyro": AXES[:3], "imu_acc": AXES[3:], "attitude": TURN, "base_lin_vel": SPEED}
 TRUNK_UNITS = {"imu_gyro": "rad/s", "imu_acc": "m/s2", "attitude": "rad", "base_lin_vel": "m/s"}
-WORST = 3
-"""Windows that are named as the worst."""
+WORST = 3  # windows that are named as the worst
 
 
 @dataclass(frozen=True)
