@@ -969,7 +969,7 @@ def import_trace(container: dict[str, Any], walk: Walk) -> Trace:
 def fit_trace(container: dict[str, Any], walk: Walk) -> Trace:
     """Errors in the report, the net's numbers, and for how long it was trained; not what the net says of itself."""
     from go1exp.cli import fit_actuator
-    from go1exp.gap.actuator_net import fitting, plots
+    from go1exp.gap.actuator_net import fitting
     from go1exp.sim.actuator.actuator_net import load
 
     def plot(result: fitting.FitResult, folder: Path) -> list[Path]:
@@ -978,7 +978,7 @@ def fit_trace(container: dict[str, Any], walk: Walk) -> Trace:
 
     epochs: list[int] = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plots, "plot", plot)
+        patch.setattr(fitting, "plot", plot)
         patch.setattr(fit_actuator, "spinner", lambda total, what: lambda done, total: epochs.append(done))
         _, files = outcome(fit_actuator.APP, container, walk)
     yield "files", sorted(files)

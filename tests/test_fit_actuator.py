@@ -15,8 +15,7 @@ from pydantic import ValidationError
 
 from go1exp.base.paths import data_root
 from go1exp.gap.actuator_net.dataset import fingerprint, smooth_motion, split, windows
-from go1exp.gap.actuator_net.fitting import FitResult, fit
-from go1exp.gap.actuator_net.plots import plot
+from go1exp.gap.actuator_net.fitting import FitResult, fit, plot
 from go1exp.gap.actuator_net.report import text
 from go1exp.gap.actuator_net.settings import FitError, FitSettings
 from go1exp.logs.recording import Meta, Recording, RecordingError, problems

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from go1exp.gap.answer import Answer, bounded_joints, weak_joints
+from go1exp.gap.report.words import sentence
 from go1exp.gap.result import Candidate, GapSettings, NamedEffect
 from go1exp.gap.search.candidates import Trial
 from go1exp.gap.search.certainty import beside_a_gap, doubt, widened
 from go1exp.gap.search.state import LastCheck, Search
-from go1exp.gap.sentence import sentence
 from go1exp.sim.effects.tolerances import DECLARED, declared
 
 JOINTS = ("a_hip", "a_thigh", "b_hip", "b_thigh")

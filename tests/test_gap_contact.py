@@ -30,7 +30,7 @@ from go1exp.gap.robots.description import parse_model
 from go1exp.gap.robots.fixed_base import robot_of
 from go1exp.gap.robots.go1 import StandingGo1, SuspendedGo1
 from go1exp.gap.score.initial_state import converged
-from go1exp.gap.search import profile_likelihood, tolerances
+from go1exp.gap.search import single_cause, tolerances
 from go1exp.gap.search.screen import Motion, library
 from go1exp.gap.search.state import Search, begun
 from go1exp.gap.search.stepwise import alone
@@ -172,7 +172,7 @@ def test_null_is_the_robots_own_time_constant() -> None:
     assert (soft.null, soft.low, soft.high, soft.tolerance) == (0.02, 0.004, 0.1, 0.003)  # as it always was
     assert (hard.null, hard.low, hard.high, hard.tolerance) == (0.005, 0.004, 0.1, 0.003)
     assert null("ground_compliance", Tolerances(contact=STIFF)) == {KEY: np.array([0.005])}
-    assert profile_likelihood.ladder(hard) == pytest.approx([0.005, 0.011, 0.017, 0.029, 0.053])
+    assert single_cause.ladder(hard) == pytest.approx([0.005, 0.011, 0.017, 0.029, 0.053])
 
 
 def test_a_hard_robot_is_probed_within_the_bounds_and_a_soft_one_as_before() -> None:

@@ -13,7 +13,8 @@ import pytest
 from go1exp.base.paths import data_root
 from go1exp.config.schema import registry
 from go1exp.config.schema.registry import members
-from go1exp.gap import answer, sentence
+from go1exp.gap import answer
+from go1exp.gap.report import words
 from go1exp.gap.robots.go1 import StandingGo1, SuspendedGo1
 from go1exp.gap.score.linear import Layout
 from go1exp.gap.search import tolerances
@@ -87,7 +88,7 @@ def test_a_new_effect_is_screened_fitted_and_worded_by_its_own_file() -> None:
         np.testing.assert_allclose(variant.probes[0].delta, 2.0 * 0.02)
     assert free_shapes("creep") == (("creep", "speed"),)
     assert answer.not_excited({"creep": 0.0})["creep"] == "slow_ramps"
-    (text,) = sentence.advice({"coulomb": ("coulomb", "creep")})
+    (text,) = words.advice({"coulomb": ("coulomb", "creep")})
     assert text == "These logs cannot tell coulomb from creep; record slow_ramps at two gain sets to separate them."
 
 

@@ -23,7 +23,7 @@ from go1exp.gap.robots.go1 import StandingGo1, SuspendedGo1
 from go1exp.gap.score.angle_errors import ON_FEET, REGIMES, localise
 from go1exp.gap.score.initial_state import converged
 from go1exp.gap.score.likelihood import Scorer, excess
-from go1exp.gap.search import profile_likelihood, reduction, single_cause
+from go1exp.gap.search import reduction, single_cause
 from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.state import Search, State, begun
 from go1exp.gap.search.stepwise import alone, run
@@ -215,12 +215,12 @@ def test_a_payload_on_a_walking_robot_fits_best_by_first_states_of_its_own() -> 
     config, recordings = recorded("excitation=[gait]", "seeds=[0,1]", "+effect.payload.mass=2.0")
     replayer, dt = ready(config, recordings)
     score, _ = converged(replayer, dt, 0.00015)
-    everything, first = np.arange(len(score.windows)), profile_likelihood.begun(score, dt)
+    everything, first = np.arange(len(score.windows)), single_cause.unmoved(score, dt)
     assert first.windows is replayer.windows
-    found, _ = profile_likelihood.fitted(first, sizes("payload"), everything, dt)
+    found, _ = single_cause.fitted_alike(first, sizes("payload"), everything, dt)
     assert found["payload", "mass"].item() == pytest.approx(2.0, abs=0.2)
     truth = {("payload", "mass"): np.array([2.0])}
-    right, none = (np.log(profile_likelihood.chi2(first, theta, everything, dt)).mean() for theta in (truth, {}))
+    right, none = (np.log(single_cause.profile_chi2(first, theta, everything, dt)).mean() for theta in (truth, {}))
     assert right < 0.5
     assert none > right + 1.0
     # By initial states that suit the nominal model the truth is hidden.
@@ -229,7 +229,7 @@ def test_a_payload_on_a_walking_robot_fits_best_by_first_states_of_its_own() -> 
 
 
 def test_rungs_of_a_ladder_are_on_both_sides_of_null_and_no_farther_than_a_parameter_goes() -> None:
-    rungs = profile_likelihood.ladder(declared(("payload", "mass")))
+    rungs = single_cause.ladder(declared(("payload", "mass")))
     assert rungs == pytest.approx([-0.8, -0.4, 0.0, 0.4, 0.8, 1.6, 3.2, 6.4])
 
 
@@ -283,7 +283,7 @@ def test_offsets_that_are_alike_are_one_cause_where_their_tolerance_does_not_rea
         missed = (theta.get(key, np.zeros(12)) - offset) / 0.001
         return np.full((len(windows), 1), 1.0 + np.mean(missed**2))
 
-    monkeypatch.setattr(profile_likelihood, "chi2", made_up)
+    monkeypatch.setattr(single_cause, "profile_chi2", made_up)
     sought = single_cause.clearest(score, State(score, parts, QUICK, 0.002))
     best, tolerance = sought.best, declared(key).tolerance
     if offset > tolerance:
@@ -307,9 +307,9 @@ def test_the_drives_of_one_part_may_be_off_together_within_their_tolerances(
         made = np.prod([np.broadcast_to(theta.get(key, np.ones(1)), (12,)) for key in keys], axis=0)
         return np.full((len(windows), 1), 1.0 + 1e4 * np.mean((made - truth) ** 2))
 
-    monkeypatch.setattr(profile_likelihood, "chi2", made_up)
+    monkeypatch.setattr(single_cause, "profile_chi2", made_up)
     begin: Theta = {keys[0]: np.full(12, others)}
-    theta = profile_likelihood.at_one_part(score, begin, keys, reduction.parts(JOINTS), np.arange(2), 0.002)
+    theta = single_cause.at_one_part(score, begin, keys, reduction.parts(JOINTS), np.arange(2), 0.002)
     if hips == others:
         assert theta == begin  # nothing fits better, so nothing changes
         return

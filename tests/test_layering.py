@@ -42,7 +42,7 @@ ORDER = {
     "sim": ("terrain.py", "physics", "actuator", "effects", "schedule.py", "task.py", "env", "gym.py"),
     "gap": (
         *("actuator_net", "result.py", "files.py", "data", "replay", "robots", "score", "search", "comparison.py"),
-        *("design", "answer.py", "sentence.py", "report", "stages"),
+        *("design", "answer.py", "report", "stages"),
     ),
     "deploy": ("estimation", "runtime", "__main__.py", "export", "sim_robot"),
     "evaluate": (

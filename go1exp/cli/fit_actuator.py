@@ -75,7 +75,7 @@ def _with_gains(recordings: list[Recording], gains: tuple[float, float] | None) 
 def _task(container: dict[str, Any]) -> None:
     settings, parts = parse_with_groups(FitActuatorSettings, container, ("robot",))
 
-    from go1exp.gap.actuator_net import fitting, plots, report
+    from go1exp.gap.actuator_net import fitting, report
 
     recordings = _with_gains(read_all(settings.recordings), settings.gains)
     existed = Path(settings.out).exists()
@@ -101,7 +101,7 @@ def _task(container: dict[str, Any]) -> None:
     result.net.save(out / "net.npz")
     result.net.export_onnx(out / "net.onnx")
     write_json(out / "report.json", result.report.as_dict())
-    pictures = plots.plot(result, out) if settings.plots else []
+    pictures = fitting.plot(result, out) if settings.plots else []
     print(report.text(result.report))
     print(f"\nwritten to {out}: net.npz, net.onnx, report.json{''.join(f', {p.name}' for p in pictures)}")
     if wrong := report.useless(result.report):

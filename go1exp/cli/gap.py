@@ -173,7 +173,7 @@ def _progress() -> Callable[[str, float], None]:
 
 def _check(recordings: list[Recording], robot: Robot, settings: GapVerb) -> int:
     """Print whether the logs can be compared, their floors, and the effects that are not identifiable from them."""
-    from go1exp.gap.stages.check import check
+    from go1exp.gap.stages.explain import check
     from go1exp.logs.audit import audit
 
     for recording in recordings:
@@ -189,7 +189,7 @@ def _check(recordings: list[Recording], robot: Robot, settings: GapVerb) -> int:
 def _localise(recordings: list[Recording], robot: Robot, settings: GapVerb) -> int:
     """Print where the nominal model is wrong."""
     from go1exp.gap.report import localisation_text
-    from go1exp.gap.stages.check import check
+    from go1exp.gap.stages.explain import check
 
     result = check(recordings, robot, settings.search, _progress(), screen=False)
     if result.where is not None:
