@@ -10,7 +10,6 @@ import numpy as np
 
 import go1exp.sim.actuator
 import go1exp.sim.effects  # noqa: F401  (registers every effect)
-from go1exp.config.schema.joint_values import JointValues
 from go1exp.config.schema.registry import Term, bind
 from go1exp.robot import MOUNT_HINGES, MOUNT_SLIDES
 from go1exp.robot.actuators import ActuatorSetup
@@ -64,20 +63,8 @@ class Machine(Protocol):
         """
 
 
-def pd() -> Term:
-    """Return the ideal PD law."""
-    return _bound("pd", {})
-
-
-def voltage(stall: JointValues | None) -> Term:
-    """Return a motor at a voltage, whose line goes from ``stall``, N m, to the robot's top speed.
-
-    None: from the robot's peak torque.
-    """
-    return _bound("voltage", {"stall": stall})
-
-
-def _bound(actuator: str, settings: Mapping[str, Any]) -> Term:
+def drive_law(actuator: str, **settings: Any) -> Term:
+    """Return a registered actuator (``pd``, ``voltage``) with its settings."""
     term = bind("actuator", actuator, settings, actuator)[0]
     assert term is not None
     return term

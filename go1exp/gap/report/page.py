@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import textwrap
+from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
 
@@ -50,10 +51,10 @@ def page(result: GapResult) -> str:
             sections=[
                 _overlays(result),
                 _localisation(result),
-                _evidence(result),
-                _waterfall(result),
+                _section("Evidence", _evidence(result), "No candidate was tried.", EVIDENCE, "evidence"),
+                _section(FALL, figures.waterfall(result), "No steps.", name="waterfall-section"),
                 *_parameters(result),
-                _stability(result),
+                _section(STABILITY, figures.bootstraps(result), "Nothing was resampled.", RESAMPLED, "stability"),
                 *_next(result),
                 *_provenance(result),
             ],
@@ -122,6 +123,26 @@ def _clock(result: GapResult) -> list[Card]:
 
 # ---------------------------------------------------------------------- sections
 
+FALL, STABILITY = "From the nominal model to the noise level", "Stability over bootstrap resamples"
+RESAMPLED = "Share of resampled episode sets that select the effect. Hatched: below the threshold of certification."
+EVIDENCE = (
+    "Every fitted candidate, best first, on held-out windows. Log gain: mean decrease of log chi2. p: sign-flip test,"
+    " corrected for the number of candidates. Tolerances: largest deviation from null, in tolerances."
+)
+LOCALISATION = (
+    "Mean of normalised chi2 - 1 by joint and regime on held-out samples. Framed and bold: significant at a false"
+    " discovery rate of 5 % (block permutation)."
+)
+
+
+def _section(title: str, blocks: Content, nothing: str, note: str = "", name: str = "") -> Section:
+    """Return a section with its note; without blocks it says that there is ``nothing``."""
+    return Section(title, blocks or [Block(nothing)], note if blocks else "", name)
+
+
+def _evidence(result: GapResult) -> list[Table]:
+    return [tables.evidence(result)] if result.candidates else []
+
 
 def _overlays(result: GapResult) -> Section:
     windows = [w for w in result.overlays[:MOST_WINDOWS] if len(w.t) and figures.rows_of(w)]
@@ -133,38 +154,15 @@ def _overlays(result: GapResult) -> Section:
         " deviations of the noise, linear up to 3 and logarithmic beyond; the grey band is ± 2."
     )
     hidden = len(result.overlays) - len(windows)
-    title, rest = (
-        "Nominal and fitted model on held-out windows",
-        [Block(f"{hidden} more in report.json.")] if hidden else [],
-    )
-    blocks: Content = [*drawn, *rest] if drawn else [Block("No curves were kept.")]
-    return Section(title, blocks, note if drawn else "", "overlays")
+    rest = [Block(f"{hidden} more in report.json.")] if hidden and drawn else []
+    title = "Nominal and fitted model on held-out windows"
+    return _section(title, [*drawn, *rest], "No curves were kept.", note, "overlays")
 
 
 def _localisation(result: GapResult) -> Section:
     maps = tables.heat_maps(result)
-    note = (
-        "Mean of normalised chi2 - 1 by joint and regime on held-out samples. Framed and bold: significant at a false"
-        " discovery rate of 5 % (block permutation)."
-    )
-    title, nothing = "Location of the model error", [Block("Nothing was compared.")]
-    key = tables.scale(result) if maps else []
-    return Section(title, maps or nothing, note if maps else "", "localisation", grid=bool(maps), key=key)
-
-
-def _evidence(result: GapResult) -> Section:
-    note = (
-        "Every fitted candidate, best first, on held-out windows. Log gain: mean decrease of log chi2. p: sign-flip"
-        " test, corrected for the number of candidates. Tolerances: largest deviation from null, in tolerances."
-    )
-    if not result.candidates:
-        return Section("Evidence", [Block("No candidate was tried.")], name="evidence")
-    return Section("Evidence", [tables.evidence(result)], note, "evidence")
-
-
-def _waterfall(result: GapResult) -> Section:
-    drawn = figures.waterfall(result)
-    return Section("From the nominal model to the noise level", drawn or [Block("No steps.")], name="waterfall-section")
+    section = _section("Location of the model error", maps, "Nothing was compared.", LOCALISATION, "localisation")
+    return replace(section, grid=True, key=tables.scale(result)) if maps else section
 
 
 def _parameters(result: GapResult) -> list[Section]:
@@ -175,13 +173,6 @@ def _parameters(result: GapResult) -> list[Section]:
     if not values.rows:
         return [Section("Parameters", [Block("No effect is identified."), *box], name="parameters")]
     return [Section("Parameters", forests, note, "parameters", grid=True), Section("", [values, *box])]
-
-
-def _stability(result: GapResult) -> Section:
-    drawn = figures.bootstraps(result)
-    note = "Share of resampled episode sets that select the effect. Hatched: below the threshold of certification."
-    blocks: Content = drawn or [Block("Nothing was resampled.")]
-    return Section("Stability over bootstrap resamples", blocks, note if drawn else "", "stability")
 
 
 def _next(result: GapResult) -> list[Section]:
@@ -204,10 +195,9 @@ def _next(result: GapResult) -> list[Section]:
 
 
 def _provenance(result: GapResult) -> list[Section]:
-    floors = tables.floors(result)
-    blocks = [floors] if floors else [Block("No noise levels were measured.")]
-    first = Section("Noise levels and provenance", blocks, name="provenance")
-    origin = tables.provenance(result)
+    floors, origin = tables.floors(result), tables.provenance(result)
+    measured = [floors] if floors else []
+    first = _section("Noise levels and provenance", measured, "No noise levels were measured.", name="provenance")
     return [first, Section("", origin, grid=True)] if origin else [first]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -100,11 +100,14 @@ def clock_rows(choice: ClockChoice) -> list[tuple[str, str, str, str, str]]:
     return rows
 
 
+def params(effect: str) -> tuple[Param, ...]:
+    """Return the declared parameters of an effect; none of an unregistered one."""
+    return effect_class(effect).params if effect in members("effect") else ()
+
+
 def param(effect: str, name: str, tolerances: Tolerances = DECLARED) -> Param | None:
     """Return the declaration of a parameter; None for an unregistered one."""
-    entry = members("effect").get(effect)
-    known: Iterable[Param] = getattr(entry.target, "params", ()) if entry else ()
-    return tolerances.param((effect, name)) if any(p.name == name for p in known) else None
+    return tolerances.param((effect, name)) if any(p.name == name for p in params(effect)) else None
 
 
 def unit(effect: str, name: str) -> str:
@@ -119,19 +122,6 @@ def meaning(effect: str) -> str:
     return entry.doc.replace("``", "") if entry else ""
 
 
-def is_size(effect: str, name: str) -> bool:
-    """Return whether a parameter is a magnitude of the effect, as opposed to a shape."""
-    declared = param(effect, name)
-    return declared is None or math.isfinite(declared.tolerance)
-
-
-def of_robot(effect: str) -> bool:
-    """Return whether an effect has one value for the whole robot."""
-    entry = members("effect").get(effect)
-    declared: Iterable[Param] = getattr(entry.target, "params", ()) if entry else ()
-    return bool(declared) and all(p.per == "robot" for p in declared)
-
-
 def everyone(result: GapResult) -> tuple[str, ...]:
     """Return all joints that were compared."""
     return result.before.joints if result.before else ()
@@ -140,7 +130,7 @@ def everyone(result: GapResult) -> tuple[str, ...]:
 def place(effect: str, joints: Sequence[str], all_joints: Sequence[str]) -> str:
     """Return the location of an effect."""
     if not joints:
-        return "the whole robot" if of_robot(effect) else NOTHING
+        return "the whole robot" if {p.per for p in params(effect)} == {"robot"} else NOTHING
     if not set(joints) <= set(all_joints):
         return ", ".join(joints)
     return where(joints, all_joints)
@@ -151,7 +141,8 @@ def sizes(named: NamedEffect) -> list[tuple[str, str, str]]:
     rows = []
     for name, by_joint in named.params.items():
         values = np.array(list(by_joint.values()), dtype=float)
-        if not len(values) or not is_size(named.effect, name):
+        declared = param(named.effect, name)
+        if not len(values) or (declared and not math.isfinite(declared.tolerance)):  # a shape
             continue
         widths = [0.5 * (b - a) for a, b in named.interval.get(name, {}).values()]
         half, in_unit = number(float(np.mean(widths)) if widths else math.nan, 2), unit(named.effect, name)
@@ -239,16 +230,10 @@ class Next:
     effects: tuple[str, ...] = ()
 
 
-def record(names: Sequence[str], *settings: str, out: str) -> str:
-    """Return the command that records excitations, quoted for a shell."""
-    words = ["go1exp", "record", f"excitation=[{','.join(names)}]", *settings, f"out={out}"]
-    return shlex.join(words)
-
-
 def motions(result: GapResult, names: Sequence[str], *settings: str, out: str) -> str:
     """Return the command that records excitations; for a robot other than the Go1, the one that designs excitations."""
     if result.provenance.get("robot", GO1) == GO1:
-        return record(names, *settings, out=out)
+        return shlex.join(["go1exp", "record", f"excitation=[{','.join(names)}]", *settings, f"out={out}"])
     return f"go1exp gap next logs=RECORDINGS model=MODEL out=GAP  # for your robot; like {', '.join(names)}"
 
 
@@ -278,24 +263,18 @@ def next_recordings(result: GapResult) -> list[Next]:
 # ---------------------------------------------------------------------- the answer in one paragraph
 
 
-def separating(names: Sequence[str]) -> tuple[str, ...]:
-    """Return what to record to separate confounded effects, each thing once; empty if none of them says."""
-    how = {name: tolerances.identification(name) for name in names}
-    return tuple(
-        dict.fromkeys(
-            how[first].separated_by if second in how[first].confounded else how[second].separated_by
-            for first, second in combinations(names, 2)
-            if second in how[first].confounded or first in how[second].confounded
-        )
-    )
-
-
 def advice(aliases: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
-    """Return what to record to separate the members of alias sets."""
+    """Return what to record to separate the members of alias sets, each thing once."""
     sentences = []
     for names in aliases.values():
         if len(names) > 1:
-            what = ", and ".join(separating(names)) or "record chirp and steps"
+            how = {name: tolerances.identification(name) for name in names}
+            ways = dict.fromkeys(
+                how[first].separated_by if second in how[first].confounded else how[second].separated_by
+                for first, second in combinations(names, 2)
+                if tolerances.confounded(first, second)
+            )
+            what = ", and ".join(ways) or "record chirp and steps"
             sentences.append(f"These logs cannot tell {' from '.join(names)}; {what} to separate them.")
     return tuple(sentences)
 

@@ -25,7 +25,7 @@ from go1exp.gap.data.cutting import Place, cut
 from go1exp.gap.data.prepare import HINT, TELLING, Ready, clock_of_speeds, noise_in_time, slope, spaced
 from go1exp.gap.data.windows import Windows
 from go1exp.gap.replay.replayer import Replayer
-from go1exp.gap.replay.rows import pd, voltage
+from go1exp.gap.replay.rows import drive_law
 from go1exp.gap.result import Clock, GapSettings, Phase
 from go1exp.gap.robots.description import Go1Model, ModelConfig
 from go1exp.gap.robots.go1 import suspended
@@ -145,7 +145,9 @@ class FixedBase:
         """Return what turns commands into torques."""
         if self.config.drive == "torque":
             return Term("torque", Entry("actuator", "torque", TorqueDrive), {})
-        return voltage(self.config.stall_torque) if self.config.drive == "voltage" else pd()
+        # The motor's line goes from the stall torque, or else the peak torque, to the top speed.
+        voltage = self.config.drive == "voltage"
+        return drive_law("voltage", stall=self.config.stall_torque) if voltage else drive_law("pd")
 
     def suited(self, recordings: Sequence[Recording], phase: Phase = "whole") -> FixedBase:
         """Return itself: its base is always fixed."""
@@ -153,7 +155,25 @@ class FixedBase:
 
     def flaws(self, recording: Recording, report: AuditReport) -> list[str]:
         """Return why a recording cannot be compared, a line each."""
-        return flaws_of(recording, report, self.config)
+        meta, name, config = recording.meta, recording.meta.episode, self.config
+        flaws = []
+        if meta.robot not in config.robots:
+            flaws.append(f"{name}: is of the robot {meta.robot!r}; the model is of {', '.join(config.robots)}; {HINT}")
+        if sorted(meta.joints) != sorted(config.joints):
+            flaws.append(f"{name}: has joints {', '.join(meta.joints)}; the model has {', '.join(config.joints)}")
+            return flaws
+        if meta.base != "fixed":
+            flaws.append(f"{name}: the base is free; only robots with a fixed base can be compared")
+        command = "tau_cmd" if config.drive == "torque" else "q_target"
+        flaws += [f"{name}: no {quantity}" for quantity in ("q", command) if not recording.has(quantity)]
+        if config.drive != "torque" and gains_of(recording, config) is None:
+            flaws.append(f"{name}: says no gains (kp, kd), and the model has none")
+        needed = {"t", "all", *joint_channels("q", meta.joints), *joint_channels(command, meta.joints)}
+        for flaw in report.flaws:
+            # Windows with a hole are left out anyway, so holes are bad only where hardly any window is left.
+            if flaw.verdict == "bad" and flaw.channel in needed and flaw.check not in (*TELLING, "gaps"):
+                flaws.append(f"{name}: {flaw.channel}: {flaw.message}")
+        return flaws
 
     def by_clock(self, clock: Clock, speeds: Literal["checked", "ignored"] | None = None) -> FixedBase:
         """Return the robot whose recordings are read by one clock; ``speeds`` as in its description, kept if None."""
@@ -189,29 +209,6 @@ class FixedBase:
     def replayer(self, windows: Windows, quats: np.ndarray, max_rows: int, threads: int) -> Replayer:
         """Return what runs this robot through windows."""
         return Replayer(self, windows, quats, max_rows, threads)
-
-
-def flaws_of(recording: Recording, report: AuditReport, config: ModelConfig) -> list[str]:
-    """Return why one recording cannot be compared, a line each."""
-    meta, name = recording.meta, recording.meta.episode
-    flaws = []
-    if meta.robot not in config.robots:
-        flaws.append(f"{name}: is of the robot {meta.robot!r}; the model is of {', '.join(config.robots)}; {HINT}")
-    if sorted(meta.joints) != sorted(config.joints):
-        flaws.append(f"{name}: has joints {', '.join(meta.joints)}; the model has {', '.join(config.joints)}")
-        return flaws
-    if meta.base != "fixed":
-        flaws.append(f"{name}: the base is free; only robots with a fixed base can be compared")
-    command = "tau_cmd" if config.drive == "torque" else "q_target"
-    flaws += [f"{name}: no {quantity}" for quantity in ("q", command) if not recording.has(quantity)]
-    if config.drive != "torque" and gains_of(recording, config) is None:
-        flaws.append(f"{name}: says no gains (kp, kd), and the model has none")
-    needed = {"t", "all", *joint_channels("q", meta.joints), *joint_channels(command, meta.joints)}
-    for flaw in report.flaws:
-        # Windows with a hole are left out anyway, so holes are bad only where hardly any window is left.
-        if flaw.verdict == "bad" and flaw.channel in needed and flaw.check not in (*TELLING, "gaps"):
-            flaws.append(f"{name}: {flaw.channel}: {flaw.message}")
-    return flaws
 
 
 def wrong_speeds(recordings: Sequence[Recording], reports: Sequence[AuditReport], config: ModelConfig) -> str:

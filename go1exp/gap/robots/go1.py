@@ -18,7 +18,7 @@ from go1exp.gap.data.standing import StandingWindows, cut_standing, for_feet, mi
 from go1exp.gap.data.swings import SwingWindows, cut_swings, for_swings
 from go1exp.gap.data.windows import Windows
 from go1exp.gap.replay.replayer import Replayer
-from go1exp.gap.replay.rows import Machine, pd
+from go1exp.gap.replay.rows import Machine, drive_law
 from go1exp.gap.replay.walking import HEAVY, StandingReplayer, SwingReplayer
 from go1exp.gap.result import GapSettings, Phase
 from go1exp.gap.robots.protocol import Robot
@@ -82,7 +82,15 @@ class Go1:
 
     def drive(self) -> Term:
         """Return the ideal PD law."""
-        return pd()
+        return drive_law("pd")
+
+    def suited(self, recordings: Sequence[Recording], phase: Phase = "whole") -> Robot:
+        """Return the robot as it is in these recordings: itself, if its trunk is free."""
+        return cast(Robot, self)
+
+    def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
+        """Return the recordings as they are."""
+        return Ready(tuple(recordings), settings)
 
     def flaws(self, recording: Recording, report: AuditReport) -> list[str]:
         """Return why a recording cannot be compared, a line each; with a free trunk, one of a held trunk can be."""
@@ -144,10 +152,6 @@ class StandingGo1(Go1):
         model.opt.disableflags |= NO_SENSORS
         return model, blocks
 
-    def suited(self, recordings: Sequence[Recording], phase: Phase = "whole") -> StandingGo1:
-        """Return itself: it can be compared with recordings of a held trunk too."""
-        return self
-
     def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
         """Return the recordings as they are, with windows that suit contact."""
         warnings = tuple(contact_warnings(recordings, self.contact))
@@ -176,10 +180,6 @@ class SwingingGo1(Go1):
         model, blocks = build_model(self.config, None, physics_dt)
         weigh_down(model, HEAVY)
         return model, blocks
-
-    def suited(self, recordings: Sequence[Recording], phase: Phase = "swing") -> SwingingGo1:
-        """Return itself."""
-        return self
 
     def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
         """Return the recordings as they are, with windows that suit swings."""
@@ -233,10 +233,6 @@ class SuspendedGo1(Go1):
         contact = contact_of(recordings, self.contact)
         held, known = replace(self, groups=ONE_GROUP), self.tolerances.on(contact)
         return StandingGo1(self.config, held=held, tolerances=known, contact=contact)
-
-    def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
-        """Return the recordings as they are."""
-        return Ready(tuple(recordings), settings)
 
     def windows(self, ready: Ready) -> Windows:
         """Cut recordings into windows."""
