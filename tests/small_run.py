@@ -32,7 +32,8 @@ def small(*overrides: str, **ppo: object) -> tuple[str, ...]:
     """
     sizes = {"num_envs": 4, "steps": 4, "minibatches": 2, "epochs": 1, "hidden": "[16,8]", "iterations": 2, **ppo}
     sizes.setdefault("schedule", "fixed")
-    machine = ("backend.threads=1", "torch_threads=1", "logger.tensorboard=false")
+    threads = () if "backend=warp" in overrides else ("backend.threads=1",)
+    machine = (*threads, "torch_threads=1", "logger.tensorboard=false")
     return plain(*(f"ppo.{key}={value}" for key, value in sizes.items()), *machine, *overrides)
 
 
