@@ -24,7 +24,7 @@ from go1exp.config.compose import compose
 from go1exp.config.schema.registry import members
 from go1exp.evaluate.rollout import EvalConfig, evaluation_task
 from go1exp.mdp.derived import ASYNC_PAIRS, SYNC_PAIRS
-from go1exp.mdp.feet import FootTimers
+from go1exp.mdp.feet import Feet
 from go1exp.mdp.measures import gait
 from go1exp.mdp.types import TermSetup
 from go1exp.sim.env.core import Go1Core
@@ -69,7 +69,7 @@ def pattern(rate: float, offset: Sequence[float], duty: float | Sequence[float] 
     return Pattern(torch.tensor([[rate]]), torch.tensor([list(offset)]), duties)
 
 
-def robots(timers: FootTimers) -> Any:
+def robots(timers: Feet) -> Any:
     """Return what a gait term looks at: robots that are commanded to walk, with these timers."""
     n = len(timers.air)
     return SimpleNamespace(
@@ -85,11 +85,11 @@ def robots(timers: FootTimers) -> Any:
 
 def steps(contacts: Callable[[int], Tensor], n: int, first: int, last: int) -> Iterator[Moment]:
     """Yield robots after each policy step; those from ``first`` on count. ``contacts``: who touches in a substep."""
-    timers = FootTimers(n, PHYSICS_DT, torch.device("cpu"))
+    timers = Feet(n, PHYSICS_DT, torch.device("cpu"))
     for step in range(last):
         timers.begin_step()
         for substep in range(SUBSTEPS):
-            timers.update(contacts(step * SUBSTEPS + substep))
+            timers.touch(contacts(step * SUBSTEPS + substep))
         yield step >= first, robots(timers)
 
 

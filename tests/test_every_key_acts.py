@@ -756,7 +756,7 @@ def provoked(core: Go1Core, steps: int = 12) -> Trace:
         qvel[:, 6:] = torch.tensor(rng.uniform(-40, 40, (n, 12)))
         core.backend.reset(here, qpos, qvel)
         for name in ("air", "contact", "last_air", "last_contact"):
-            getattr(core.feet.timers, name)[here] = torch.tensor(rng.uniform(0, 1, (n, 4)), dtype=torch.float32)[here]
+            getattr(core.feet, name)[here] = torch.tensor(rng.uniform(0, 1, (n, 4)), dtype=torch.float32)[here]
         core.command.value[here & (torch.arange(n) % 4 < 2)] = 0.0
         for part in (core.command, *core.events.values()):
             if hasattr(part, "time_left"):

@@ -15,7 +15,7 @@ from go1exp import robot
 from go1exp.config.compose import compose
 from go1exp.extend.testing.snapshots import random_snapshot
 from go1exp.mdp.derived import slip_speed
-from go1exp.mdp.feet import Feet, FootTimers
+from go1exp.mdp.feet import Feet
 from go1exp.mdp.kinematics import foot_positions
 from go1exp.mdp.rewards import foot_force, foot_peak_force
 from go1exp.sim.env.core import Go1Core
@@ -28,7 +28,7 @@ QUIET = ("rand=none", "event=none", "termination=none", "command=forward")
 
 def feed(feet: Feet, force: float, descent: float) -> None:
     """One physics step in which every foot of every robot has this vertical force and downward speed."""
-    like = torch.zeros(len(feet.timers.air), robot.NUM_LEGS, 3)
+    like = torch.zeros(len(feet.air), robot.NUM_LEGS, 3)
     feet.update(like + torch.tensor([0.0, 0.0, force]), like + torch.tensor([3.0, 0.0, -descent]))
 
 
@@ -39,7 +39,7 @@ def test_the_touchdown_speed_is_that_before_the_first_force_and_stays_until_the_
     for force, descent in [(0, 0.7), (0, 0.8), (300, 0.9), (80, -0.1), (0, -0.2), (0, 0.1), (50, 0.3), (40, 0.0)]:
         feet.begin_step()
         feed(feet, force, descent)
-        seen.append((feet.impacts.touchdown_speed[0, 0].item(), feet.impacts.peak_force[0, 0].item()))
+        seen.append((feet.touchdown_speed[0, 0].item(), feet.peak_force[0, 0].item()))
     speeds, forces = zip(*seen, strict=True)
     assert speeds == pytest.approx([0, 0, 0.9, 0.9, 0.9, 0.9, 0.3, 0.3])
     assert forces == pytest.approx([0, 0, 300, 80, 0, 0, 50, 40])
@@ -49,8 +49,8 @@ def test_a_foot_that_moves_up_when_it_touches_has_no_touchdown_speed() -> None:
     feet = Feet(1, 0.002, torch.device("cpu"))
     feed(feet, 0, 0.5)
     feed(feet, 20, -0.5)
-    assert feet.timers.touchdown.all()
-    assert not feet.impacts.touchdown_speed.any()
+    assert feet.touchdown.all()
+    assert not feet.touchdown_speed.any()
 
 
 def test_the_peak_force_covers_the_substeps_of_one_policy_step_and_has_all_three_components() -> None:
@@ -60,19 +60,19 @@ def test_the_peak_force_covers_the_substeps_of_one_policy_step_and_has_all_three
     for vector in ([3.0, 0.0, 4.0], [0.0, 12.0, 5.0], [0.0, 0.0, 1.0]):
         force[0, 1] = torch.tensor(vector)
         feet.update(force, still)
-    assert feet.impacts.peak_force.tolist() == [[0, 13, 0, 0], [0, 0, 0, 0]]
+    assert feet.peak_force.tolist() == [[0, 13, 0, 0], [0, 0, 0, 0]]
     feet.begin_step()
     feet.update(force, still)
-    assert feet.impacts.peak_force[0].tolist() == [0, 1, 0, 0]
+    assert feet.peak_force[0].tolist() == [0, 1, 0, 0]
 
 
 def test_a_reset_zeroes_its_rows_even_where_they_are_not_finite() -> None:
     feet = Feet(3, 0.002, torch.device("cpu"))
     feed(feet, 0, 0.5)
     feed(feet, 10, 0.5)
-    feet.impacts.peak_force[1] = torch.nan
+    feet.peak_force[1] = torch.nan
     feet.reset(torch.tensor([False, True, False]))
-    for values in (feet.impacts.peak_force, feet.impacts.touchdown_speed):
+    for values in (feet.peak_force, feet.touchdown_speed):
         assert values.abs().sum(1).gt(0).tolist() == [True, False, True]
 
 
@@ -215,22 +215,22 @@ def expected(flags: np.ndarray, substep: int) -> dict[str, float]:
     }
 
 
-def run_through(timers: FootTimers, flags: np.ndarray) -> None:
+def run_through(timers: Feet, flags: np.ndarray) -> None:
     for k, row in enumerate(flags):
         if k % SUBSTEPS == 0:
             timers.begin_step()
-        timers.update(torch.as_tensor(row))
+        timers.touch(torch.as_tensor(row))
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_timers_agree_with_a_count_of_the_whole_history(seed: int) -> None:
     n = 5
     flags = random_contacts(seed, 400, n)
-    timers = FootTimers(n, DT, torch.device("cpu"))
+    timers = Feet(n, DT, torch.device("cpu"))
     for k in range(len(flags)):
         if k % SUBSTEPS == 0:
             timers.begin_step()
-        timers.update(torch.as_tensor(flags[k]))
+        timers.touch(torch.as_tensor(flags[k]))
         if k % 7 and k % SUBSTEPS:
             continue  # every seventh step and every policy step will do
         for env in range(n):
@@ -242,12 +242,12 @@ def test_timers_agree_with_a_count_of_the_whole_history(seed: int) -> None:
 
 def test_a_hop_by_hand() -> None:
     """On the ground for 3 steps, in the air for 5, on the ground for 2, then off again."""
-    timers = FootTimers(1, 0.1, torch.device("cpu"))
+    timers = Feet(1, 0.1, torch.device("cpu"))
     history = []
     for touching in [1, 1, 1, 0, 0, 0, 0, 0, 1, 1, 0]:
         timers.begin_step()
-        timers.update(torch.full((1, 4), bool(touching)))
-        history.append([getattr(timers, name)[0, 0].item() for name in FootTimers.memory])
+        timers.touch(torch.full((1, 4), bool(touching)))
+        history.append([getattr(timers, name)[0, 0].item() for name in Feet.timers])
     by_hand = [  # air, contact, last air, last contact, touchdown
         [0.0, 0.1, 0.0, 0.0, 0],
         [0.0, 0.2, 0.0, 0.0, 0],
@@ -265,11 +265,11 @@ def test_a_hop_by_hand() -> None:
 
 
 def test_a_touchdown_is_remembered_for_the_rest_of_the_policy_step() -> None:
-    timers = FootTimers(1, DT, torch.device("cpu"))
+    timers = Feet(1, DT, torch.device("cpu"))
     timers.begin_step()
     seen = []
     for touching in [False, True, False, False]:
-        timers.update(torch.full((1, 4), touching))
+        timers.touch(torch.full((1, 4), touching))
         seen.append(timers.touchdown.all().item())
     assert seen == [False, True, True, True]
     timers.begin_step()
@@ -278,16 +278,16 @@ def test_a_touchdown_is_remembered_for_the_rest_of_the_policy_step() -> None:
 
 def test_a_reset_zeroes_its_rows_and_they_go_on_as_new() -> None:
     flags = random_contacts(9, 200, 4)
-    reset, plain, new = (FootTimers(4, DT, torch.device("cpu")) for _ in range(3))
+    reset, plain, new = (Feet(4, DT, torch.device("cpu")) for _ in range(3))
     run_through(reset, flags[:100])
     run_through(plain, flags[:100])
     mask = torch.tensor([True, False, False, True])
     reset.reset(mask)
-    for name in FootTimers.memory:
+    for name in Feet.timers:
         assert not getattr(reset, name)[mask].any()
     for timers in (reset, plain, new):
         run_through(timers, flags[100:])
-    for name in FootTimers.memory:
+    for name in Feet.timers:
         after = getattr(reset, name)
         assert torch.equal(after[mask], getattr(new, name)[mask]), name
         assert torch.equal(after[~mask], getattr(plain, name)[~mask]), name
@@ -295,13 +295,13 @@ def test_a_reset_zeroes_its_rows_and_they_go_on_as_new() -> None:
 
 def test_timers_continue_from_their_saved_state() -> None:
     flags = random_contacts(3, 200, 4)
-    first, second = FootTimers(4, DT, torch.device("cpu")), FootTimers(4, DT, torch.device("cpu"))
+    first, second = Feet(4, DT, torch.device("cpu")), Feet(4, DT, torch.device("cpu"))
     run_through(first, flags[:105])
     second.load_state_dict(first.state_dict())
     for row in torch.as_tensor(flags[105:]):
-        first.update(row)
-        second.update(row)
-    for name in FootTimers.memory:
+        first.touch(row)
+        second.touch(row)
+    for name in Feet.timers:
         assert torch.equal(getattr(first, name), getattr(second, name))
 
 

@@ -22,11 +22,12 @@ from go1exp.base.paths import data_root
 from go1exp.cli.tune import _ranges
 from go1exp.config.schema.registry import ConfigError
 from go1exp.train import run_state
+from go1exp.train.early_stop import logged
 from go1exp.train.sweep import index
 from go1exp.train.sweep.command import Command, Running, Task, run
 from go1exp.train.sweep.launchers import LAUNCHERS, chosen, shares
 from go1exp.train.sweep.slurm import Slurm
-from go1exp.train.sweep.tune import Range, _rows
+from go1exp.train.sweep.tune import Range
 
 CONF = data_root() / "conf"
 
@@ -176,7 +177,7 @@ def test_ranges_are_read_in_the_grammar_of_sweeps() -> None:
 
 def test_a_row_that_is_half_written_has_no_value_yet(tmp_path: Path) -> None:
     file = tmp_path / "metrics.csv"
-    assert list(_rows(file, "a")) == []
+    assert list(logged(tmp_path, "a")) == []
     file.write_text("iteration,steps,a\n1,16,0.5\n2,32,\n3,48,nan\n4,64,2.0\n5,80,3")
-    assert list(_rows(file, "a")) == [(1, 0.5), (4, 2.0)]
-    assert list(_rows(file, "b")) == []
+    assert list(logged(tmp_path, "a")) == [(1, 0.5), (4, 2.0)]
+    assert list(logged(tmp_path, "b")) == []

@@ -133,7 +133,7 @@ def test_noise_delay_and_physics_rate_are_in_force(session: Session) -> None:
     assert session.message == ""
     assert session.core.noise
     assert session.core.task.sim.physics_dt == pytest.approx(0.001)
-    assert float(session.core.plant.effects.effects["command_delay"].delay[0, 0]) == pytest.approx(0.02)  # type: ignore[attr-defined]
+    assert float(session.core.plant.effects.effects["command_delay"].delay[0, 0]) == pytest.approx(0.02)
     walk(session, 0.1)
 
 

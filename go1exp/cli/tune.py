@@ -57,7 +57,8 @@ def _task(container: dict[str, Any]) -> int | None:
         raise ConfigError(["go1exp tune needs the package optuna: pip install 'go1exp[tune]'"])
 
     from go1exp.cli import train
-    from go1exp.train.sweep.tune import EVALUATED, Search
+    from go1exp.config.schema.training import EVALUATED
+    from go1exp.train.sweep.tune import Search
 
     def plan(overrides: Sequence[str], run: Path) -> None:
         job = train.resolved(compose_checked("train", overrides), list(overrides), run)

@@ -138,6 +138,10 @@ class WideningVelocity(UniformVelocity):
         self.age += dt
         super().advance(dt, restart)
 
+    def renew(self) -> None:
+        """Begin with slow commands again."""
+        self.age.zero_()
+
     def share(self) -> Tensor:
         """(N, 1) of the ranges that velocities are drawn from."""
         return (self._start + (1.0 - self._start) * self.age / self._over).clamp(max=1.0).unsqueeze(1)

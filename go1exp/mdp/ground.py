@@ -17,7 +17,7 @@ SCAN_SPACING = 0.1
 
 
 class GroundHeight:
-    """Looks up the height of the triangulated ground: `go1exp.sim.terrain.Terrain.height_at` in torch.
+    """Looks up the height of the triangulated ground (`go1exp.sim.terrain.Terrain`).
 
     Shapes depend on the argument alone and nothing waits for the device, so a call may be captured in a CUDA graph. A
     point that is not finite gives NaN, or the height of an edge if infinite, and never an index error.

@@ -28,23 +28,6 @@ class ModelFields(Protocol):
         """Indices of named bodies or geoms."""
 
 
-class CompiledModel(Protocol):
-    """What effects need of a physics backend to change its model."""
-
-    @property
-    def num_envs(self) -> int:
-        """N, the robots."""
-
-    def compiled(self, name: str) -> Tensor:
-        """The compiled model's values of a field, without any effect."""
-
-    def nominal(self, name: str) -> Tensor:
-        """The values ``(1 or N, ...)`` that randomisation starts from."""
-
-    def ids(self, kind: str, names: tuple[str, ...]) -> Tensor:
-        """Indices of named bodies or geoms."""
-
-
 @dataclass(frozen=True)
 class ActuatorSetup:
     """The actuators of N robots.

@@ -5,8 +5,8 @@ ground and follow +y, as in legged_gym. A tile is at height 0 along its whole bo
 
 The kinds follow the paper ("boxes with slight variations in height close to 0 on the z-axis", "bumpy patches by adding
 noise to terrain heights", ramps in its figure); tile grid, column rule and interpolation follow legged_gym, sizes the
-Go1 rough task of Isaac Lab. Nothing here knows the simulator or torch: `sim/physics/scene.py` hands the field to
-MuJoCo, `mdp/ground.py` reads it for batches.
+Go1 rough task of Isaac Lab. Nothing here knows the simulator: `sim/physics/scene.py` hands the field to MuJoCo,
+`mdp/ground.py` has the law of heights between samples.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, ConfigDict, Field
 
 from go1exp.config.schema.registry import STRICT, NonNegative, Positive, ordered
+from go1exp.mdp.ground import GroundHeight
 
 TILE_TYPES = ("boxes", "bumps", "ramp_up", "ramp_down", "flat")
 """Kinds of tile, in the order in which columns take them."""
@@ -162,16 +163,10 @@ class Terrain:
         Args:
             xy: World positions, (..., 2), m.
         """
-        xy = np.asarray(xy, dtype=np.float64)
-        ny, nx = self.heights.shape
-        u = np.clip((xy[..., 0] - self.x0) / self.resolution, 0, nx - 1)
-        v = np.clip((xy[..., 1] - self.y0) / self.resolution, 0, ny - 1)
-        i = np.minimum(u.astype(np.intp), nx - 2)
-        j = np.minimum(v.astype(np.intp), ny - 2)
-        u, v = u - i, v - j
-        low, high = self.heights[j, i], self.heights[j + 1, i + 1]
-        right, far = self.heights[j, i + 1], self.heights[j + 1, i]
-        return low + np.where(u >= v, u * (right - low) + v * (high - right), v * (far - low) + u * (high - far))
+        import torch
+
+        ground = GroundHeight(torch.as_tensor(self.heights), self.x0, self.y0, self.resolution)
+        return ground(torch.as_tensor(np.asarray(xy, dtype=np.float64))).numpy()
 
 
 def build_terrain(config: TerrainConfig) -> Terrain:

@@ -7,7 +7,7 @@ import dataclasses
 import json
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ class EarlyStop:
         self._best, self._since = -math.inf, 0
         self._warned = False
         (run / FILE).unlink(missing_ok=True)
-        for k, value in _logged(run, rule.figure or ""):
+        for k, value in logged(run, rule.figure) if rule.figure else ():
             if k <= iteration:
                 self._take(k, value)
 
@@ -37,7 +37,9 @@ class EarlyStop:
         if rule.figure is None:
             return ""
         if rule.figure not in metrics:
-            self._warn_once(rule.figure, metrics)
+            if not self._warned and not rule.figure.startswith(EVALUATED):  # those come later than others
+                self._warned = True
+                warnings.warn(unknown_name("stop.figure", rule.figure, metrics, "metric"), stacklevel=2)
             return ""
         value = float(metrics[rule.figure])
         self._take(iteration, value)
@@ -49,12 +51,6 @@ class EarlyStop:
             return f"{rule.figure} is no better than {abs(self._best):.4g} since iteration {self._since}"
         return ""
 
-    def _warn_once(self, figure: str, metrics: Mapping[str, Any]) -> None:
-        """Say that the rule waits for a metric that there is not; those of an evaluation come later than others."""
-        if not self._warned and not figure.startswith(EVALUATED):
-            self._warned = True
-            warnings.warn(unknown_name("stop.figure", figure, metrics, "metric"), stacklevel=2)
-
     def note(self, iteration: int, reason: str) -> None:
         """Leave in the run folder that the run is complete, and by which rule."""
         write_json(self._run / FILE, {"iteration": iteration, "reason": reason, "rule": dataclasses.asdict(self._rule)})
@@ -65,15 +61,24 @@ class EarlyStop:
             self._best, self._since = good, iteration
 
 
-def _logged(run: Path, figure: str) -> list[tuple[int, float]]:
-    """Return iteration and value of each row that has one; those of evaluations have a file of their own."""
-    evaluated = figure.startswith(EVALUATED)
-    file, figure = run / (ROWS if evaluated else "metrics.csv"), figure.removeprefix(EVALUATED)
-    if not figure or not file.is_file():
-        return []
-    with file.open(newline="") as opened:
-        rows = list(csv.DictReader(opened))
-    return [(int(row["iteration"]), float(row[figure])) for row in rows if row.get(figure)]
+def file_of(figure: str) -> str:
+    """Return the file of a run folder that has a figure: those of evaluations have one of their own."""
+    return ROWS if figure.startswith(EVALUATED) else "metrics.csv"
+
+
+def logged(run: Path, figure: str) -> Iterator[tuple[int, float]]:
+    """Yield iteration and value of each row that has a finite one; a row half written has none yet."""
+    try:
+        text = (run / file_of(figure)).read_text()
+    except OSError:
+        return
+    for row in csv.DictReader(text[: text.rfind("\n") + 1].splitlines()):
+        try:
+            iteration, value = int(row["iteration"]), float(row[figure.removeprefix(EVALUATED)] or "nan")
+        except (KeyError, ValueError, TypeError):
+            continue
+        if math.isfinite(value):
+            yield iteration, value
 
 
 def ended(run: Path, rule: StopRule) -> str:

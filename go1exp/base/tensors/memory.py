@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -30,6 +30,9 @@ class Memory:
         for name in self.memory:
             getattr(self, name).copy_(state[name])
 
+    def renew(self) -> None:
+        """Forget, in place, what outlives an episode; called when everything begins anew with another seed."""
+
 
 class DelayLine(Memory):
     """The last samples of a signal (N, J), read back at a delay that may be a fraction of the sample period.
@@ -44,26 +47,13 @@ class DelayLine(Memory):
         self, num_envs: int, joints: int, longest: float, dt: float, dtype: torch.dtype, device: torch.device
     ) -> None:
         """Allocate for delays up to ``longest`` s of a signal sampled every ``dt`` s."""
-        self._dt, self._longest = dt, longest
+        self._dt = dt
         self._oldest = math.ceil(longest / dt - 1e-9)  # samples back
         slots = 1 << (self._oldest + 1).bit_length()  # a power of two: places wrap around by a mask
         self._wrap = slots - 1
         self._past = torch.zeros(slots, num_envs, joints, dtype=dtype, device=device)
         self._newest = torch.zeros(1, dtype=torch.int64, device=device)
         self._age = torch.zeros(num_envs, 1, dtype=dtype, device=device)
-
-    def twin(self) -> DelayLine:
-        """Return an empty line for another signal (N, J) of the same kind."""
-        _, n, joints = self._past.shape
-        return DelayLine(n, joints, self._longest, self._dt, self._past.dtype, self._past.device)
-
-    def restored(self, state: dict[str, Tensor] | None) -> DelayLine | None:
-        """Return a twin with the state of one; None for None."""
-        if state is None:
-            return None
-        twin = self.twin()
-        twin.load_state_dict(state)
-        return twin
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Write the state back; that of an older version has as many places as the longest delay needs."""
@@ -98,6 +88,40 @@ class DelayLine(Memory):
         after = self._past.gather(0, index)
         before = self._past.gather(0, index.sub_(1).bitwise_and_(self._wrap))
         return torch.lerp(after, before, steps.frac()).squeeze(0)
+
+
+class CommandLine(DelayLine):
+    """A delay line of targets, with one of torques that are fed forward beside it, from the first such torque on."""
+
+    def __init__(
+        self, num_envs: int, joints: int, longest: float, dt: float, dtype: torch.dtype, device: torch.device
+    ) -> None:
+        """Allocate as ``DelayLine`` does."""
+        super().__init__(num_envs, joints, longest, dt, dtype, device)
+        self._new = functools.partial(DelayLine, num_envs, joints, longest, dt, dtype, device)
+        self._fed: DelayLine | None = None
+
+    def fed(self, torque: Tensor, steps: Tensor) -> Tensor:
+        """Take the newest ``torque`` (N, J) and return that of ``steps`` samples ago, as :meth:`at` does."""
+        self._fed = self._fed or self._new()
+        return self._fed.at(torque, steps)
+
+    def reset(self, mask: Tensor) -> None:
+        """Let the next target and torque stand for the whole past in the rows of ``mask`` (N,)."""
+        super().reset(mask)
+        if self._fed:
+            self._fed.reset(mask)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return copies of both pasts."""
+        return {**super().state_dict(), **({"fed": self._fed.state_dict()} if self._fed else {})}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Write both pasts back; without one of torques there is none."""
+        super().load_state_dict(state)
+        self._fed = self._new() if "fed" in state else None
+        if self._fed:
+            self._fed.load_state_dict(state["fed"])
 
 
 @functools.cache

@@ -156,7 +156,7 @@ class Session:
         self._recorder = Recorder(self.core, len(plan.command) - (plan.listen_from or 0)) if recording else None
         self._kicker = Kicker(self.core.backend, task.sim.physics_dt, plan.impulses) if plan.impulses else None
         if plan.delay is not None:  # before the first reset, which puts effects into force
-            late: Tensor = self.core.plant.effects.effects[DELAY].delay  # type: ignore[attr-defined]
+            late: Tensor = self.core.plant.effects.effects[DELAY].delay
             usual = delay_of_effects(stage.agent.task)
             late.copy_(torch.from_numpy(plan.delay + usual)[:, None].expand_as(late))
         assert isinstance(self.core.command, _Scheduled)

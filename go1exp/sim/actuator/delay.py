@@ -8,7 +8,7 @@ import torch
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
-from go1exp.base.tensors.memory import DelayLine
+from go1exp.base.tensors.memory import CommandLine
 from go1exp.config.schema.registry import actuator, bind, members, ordered
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.actuator.motors import Actuator, takes_feedforward
@@ -63,8 +63,7 @@ class Delay:
         self._range: tuple[float, float] | Tensor = command
         self._random = setup.random
         joints = len(setup.joints)
-        self._line = DelayLine(setup.num_envs, joints, command[1], setup.physics_dt, setup.dtype, setup.device)
-        self._fed: DelayLine | None = None  # feedforward on its way; only where there is any
+        self._line = CommandLine(setup.num_envs, joints, command[1], setup.physics_dt, setup.dtype, setup.device)
 
     @property
     def kp(self) -> Tensor:
@@ -88,13 +87,12 @@ class Delay:
 
     def torque(self, target: Tensor, q: Tensor, qd: Tensor, feedforward: Tensor | None = None) -> Tensor:
         """Return the joint torques (N, J), N m; target and q in rad, qd in rad/s; ``feedforward`` is delayed too."""
-        delayed = self._line.advance(target, self.delay)
+        steps = self._line.steps(self.delay)
+        delayed = self._line.at(target, steps)
         if feedforward is None:
             return self.drive.torque(delayed, q, qd)
         assert takes_feedforward(self.drive)  # the plant has asked
-        if self._fed is None:
-            self._fed = self._line.twin()
-        return self.drive.torque(delayed, q, qd, self._fed.advance(feedforward, self.delay))
+        return self.drive.torque(delayed, q, qd, self._line.fed(feedforward, steps))
 
     def reset(self, mask: Tensor) -> None:
         """Draw new delays in the rows of ``mask`` (N,) and take the next target for one long in force."""
@@ -102,18 +100,14 @@ class Delay:
         drawn = self._random.stream("actuator.delay").uniform(1, low=low, high=high).to(self.delay.dtype)
         self.delay.copy_(torch.where(mask.unsqueeze(1), drawn.clamp(low, high), self.delay))
         self._line.reset(mask)
-        if self._fed:
-            self._fed.reset(mask)
         self.drive.reset(mask)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the delays, the targets on their way and the history of the actuator inside."""
-        state = {"delay": self.delay.clone(), "line": self._line.state_dict(), "drive": self.drive.state_dict()}
-        return state | ({"fed": self._fed.state_dict()} if self._fed else {})
+        return {"delay": self.delay.clone(), "line": self._line.state_dict(), "drive": self.drive.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from ``state_dict``, in place."""
         self.delay.copy_(state["delay"])
         self._line.load_state_dict(state["line"])
-        self._fed = self._line.restored(state.get("fed"))
         self.drive.load_state_dict(state["drive"])

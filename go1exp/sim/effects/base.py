@@ -199,7 +199,7 @@ class Gears:
 class Effect(Memory):
     """Base of all effects.
 
-    A subclass has a ``title``, lists its ``params``, annotates one attribute for each, and overrides the hooks that it
+    A subclass has a ``title``, lists its ``params``, each of which is an attribute, and overrides the hooks that it
     needs and no others. All tensors are (N, J) unless said, angles in rad, speeds in rad/s, torques in N m.
 
     On the way of a torque, the hooks are called in this order, and among the effects of one hook in that of ``order``:
@@ -221,6 +221,11 @@ class Effect(Memory):
     """Whether it acts on joints between the world and a trunk that is held (``sim/physics/scene.py``)."""
     order: ClassVar[int] = 0
     """Place among the effects of the same hook: smaller is nearer to the command."""
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Tensor:
+            """Values of the parameter ``name``, (N, J) or (N, 1)."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)

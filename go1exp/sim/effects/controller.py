@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from go1exp.base.tensors.memory import DelayLine
+from go1exp.base.tensors.memory import CommandLine
 from go1exp.config.schema.joint_values import JointValues
 from go1exp.config.schema.registry import effect
 from go1exp.robot.actuators import ActuatorSetup
@@ -35,7 +35,6 @@ class DeadBand(Effect):
         confounded=("coulomb", "backlash"),
         separated_by=TWO_GAIN_SETS,
     )
-    band: Tensor
 
     def on_error(self, target: Tensor, q: Tensor) -> Tensor:
         """Return the target, or the angle where that is as good."""
@@ -64,7 +63,6 @@ class EncoderOffset(Effect):
         "robot: look at its zeros, or record it suspended, before training takes it.",
     )
     order = 10  # after the transmission: the encoder reads the motor's side
-    offset: Tensor
 
     def on_encoder(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
         """Return the reading."""
@@ -89,7 +87,6 @@ class FixedPoint(Effect):
         levels=({"steps": 4.0},), excitation="torque_off", confounded=("viscous",), separated_by=TWO_KD
     )
     order = -10
-    steps: Tensor
 
     def _cut(self, values: Tensor, step: float) -> Tensor:
         """Return values (N, J) in whole steps, towards zero; as they are where there are none."""
@@ -123,7 +120,6 @@ class KdScale(Effect):
     identification = Identification(
         nominal=True, rank=1, excitation="torque_off", confounded=("viscous",), separated_by=TWO_KD
     )
-    scale: Tensor
 
     def on_gains(self, kp: Tensor, kd: Tensor) -> tuple[Tensor, Tensor]:
         """Return the gains with the real kd."""
@@ -148,7 +144,6 @@ class KpScale(Effect):
         confounded=("armature", "link_mass", "strength"),
         separated_by=TWO_GAIN_SETS,
     )
-    scale: Tensor
 
     def on_gains(self, kp: Tensor, kd: Tensor) -> tuple[Tensor, Tensor]:
         """Return the gains with the real kp."""
@@ -158,13 +153,13 @@ class KpScale(Effect):
 class Delayed(Effect):
     """Base of effects with a parameter ``delay`` in s, up to that parameter's upper bound."""
 
-    delay: Tensor
-
     def __init__(self, setup: ActuatorSetup, **values: JointValues) -> None:
         """Allocate the past."""
         super().__init__(setup, **values)
         (longest,) = (p.high for p in self.params if p.name == "delay")
-        self._line = DelayLine(setup.num_envs, len(setup.joints), longest, setup.physics_dt, setup.dtype, setup.device)
+        self._line = CommandLine(
+            setup.num_envs, len(setup.joints), longest, setup.physics_dt, setup.dtype, setup.device
+        )
         self._steps = self._line.steps(self.delay)
 
     def prepare(self) -> None:
@@ -202,31 +197,9 @@ class CommandDelay(Delayed):
     params = (Param("delay", "s", 0.0, 0.06, 0.0, 0.001, "joint", "age of the target"),)
     identification = Identification(nominal=True, rank=10, levels=({"delay": 0.01},), excitation="steps")
 
-    def __init__(self, setup: ActuatorSetup, **values: JointValues) -> None:
-        """Allocate the past of targets; that of feed-forward torques is allocated with the first of them."""
-        super().__init__(setup, **values)
-        self._fed: DelayLine | None = None
-
     def on_feedforward(self, torque: Tensor) -> Tensor:
         """Return the feed-forward torque of ``delay`` ago: it comes with the target."""
-        if self._fed is None:
-            self._fed = self._line.twin()
-        return self._fed.at(torque, self._steps)
-
-    def reset(self, mask: Tensor) -> None:
-        """Let the next target and torque stand for the whole past in the rows of ``mask`` (N,)."""
-        super().reset(mask)
-        if self._fed:
-            self._fed.reset(mask)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return copies of the values and the past."""
-        return {**super().state_dict(), **({"fed": self._fed.state_dict()} if self._fed else {})}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Write values and past back."""
-        super().load_state_dict(state)
-        self._fed = self._line.restored(state.get("fed"))
+        return self._line.fed(torque, self._steps)
 
     def on_target(self, target: Tensor) -> Tensor:
         """Return the target of ``delay`` ago."""
@@ -268,7 +241,6 @@ class Lag(Effect):
     identification = Identification(confounded=("torque_delay",), separated_by=SHARP_EDGES)
     memory = ("_made", "_asked", "_fresh")
     order = 40
-    time: Tensor
 
     def __init__(self, setup: ActuatorSetup, **values: JointValues) -> None:
         """Begin settled."""

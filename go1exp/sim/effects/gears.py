@@ -58,8 +58,6 @@ class AsymmetricFriction(Effect):
     identification = Identification(
         simpler="coulomb", simpler_if_equal=("forward", "backward"), excitation="slow_ramps"
     )
-    forward: Tensor
-    backward: Tensor
 
     def on_joint(self, q: Tensor, qd: Tensor) -> Tensor:
         """Return the constant half of the difference."""
@@ -84,7 +82,6 @@ class Coulomb(Effect):
     params = (Param("bound", "N m", 0.0, 3.0, 0.0, 0.05, "joint", "friction torque"),)
     identification = Identification(nominal=True, rank=4, excitation="slow_ramps")
     fields = ("dof_frictionloss",)
-    bound: Tensor
 
     def edit_model(self, model: ModelFields) -> None:
         """Raise the friction bound of the joints."""
@@ -119,8 +116,6 @@ class LoadFriction(Effect):
         confounded=("coulomb",),
         separated_by="record slow_ramps through poses of different load, and torque_off",
     )
-    coefficient: Tensor
-    external: Tensor
 
     def on_load(self, bound: Tensor, torque: Tensor, outside: Tensor) -> Tensor:
         """Return the bound with the share of the load."""
@@ -138,7 +133,6 @@ class QuadraticDrag(Effect):
 
     title = "drag that grows with the square of speed"
     params = (Param("drag", "N m s2/rad2", 0.0, 0.05, 0.0, 0.002, "joint", "torque per speed squared"),)
-    drag: Tensor
 
     def on_joint(self, q: Tensor, qd: Tensor) -> Tensor:
         """Return the torque against the motion."""
@@ -163,9 +157,6 @@ class Stribeck(Effect):
     identification = Identification(
         shapes=({"speed": 0.1}, {"speed": 0.5}), free_shapes=("speed",), simpler="coulomb", excitation="slow_ramps"
     )
-    strength: Tensor
-    speed: Tensor
-    exponent: Tensor
 
     def on_friction(self, bound: Tensor, torque: Tensor, qd: Tensor) -> Tensor:
         """Return the bound with what is left of the further friction."""
@@ -186,7 +177,6 @@ class Viscous(Effect):
     identification = Identification(
         nominal=True, rank=5, excitation="torque_off", confounded=("kd_scale",), separated_by=TWO_KD
     )
-    damping: Tensor
 
     def on_joint(self, q: Tensor, qd: Tensor) -> Tensor:
         """Return the torque against the motion."""
@@ -209,7 +199,6 @@ class Backlash(Effect):
     title = "play in the gears"
     params = (Param("gap", "rad", 0.0, 0.1, 0.0, 0.001, "joint", "free angle from flank to flank"),)
     identification = Identification(levels=({"gap": 0.002}, {"gap": 0.015}), excitation="slow_ramps")
-    gap: Tensor
 
     def on_gears(self, gears: Gears) -> Gears:
         """Add the gap."""
@@ -233,8 +222,6 @@ class Flexibility(Effect):
         Param("damping", "-", 0.02, 1.0, 0.05, math.inf, "joint", "damping ratio of the rotor on this spring"),
     )
     identification = Identification(levels=({"compliance": 0.001}, {"compliance": 0.004}))
-    compliance: Tensor
-    damping: Tensor
 
     def on_gears(self, gears: Gears) -> Gears:
         """Add the compliance."""

@@ -14,7 +14,7 @@ from go1exp.robot.actuators import ModelFields
 from go1exp.sim.effects.base import Effect, Identification, Param
 
 if TYPE_CHECKING:
-    from torch import Tensor
+    pass
 
 
 @effect("foot_friction")
@@ -32,7 +32,6 @@ class FootFriction(Effect):
         nominal=True, rank=22, needs_ground=True, levels=({"scale": -0.3}, {"scale": 0.3}), excitation="squat"
     )
     fields = ("geom_friction",)
-    scale: Tensor
 
     def edit_model(self, model: ModelFields) -> None:
         """Scale it."""
@@ -68,7 +67,6 @@ class GroundCompliance(Effect):
         excitation="drop",
     )
     fields = ("geom_solref",)
-    time_constant: Tensor
 
     @classmethod
     def nominal(cls, contact: ContactConfig) -> Mapping[str, float]:

@@ -38,9 +38,6 @@ class Cogging(Effect):
         free_shapes=("phase", "count"),
         excitation="slow_ramps",
     )
-    amplitude: Tensor
-    count: Tensor
-    phase: Tensor
 
     def on_joint(self, q: Tensor, qd: Tensor) -> Tensor:
         """Return the torque at this angle."""
@@ -84,10 +81,6 @@ class JointStop(Effect):
         separated_by="record steps that reach the stops, and slow_ramps that do not",
     )
     fields = ("jnt_solref", "jnt_range")
-    time_constant: Tensor
-    restitution: Tensor
-    lower: Tensor
-    upper: Tensor
 
     def edit_model(self, model: ModelFields) -> None:
         """Set them; the driven joints are the model's last. No stop passes the middle of the range."""
@@ -121,8 +114,6 @@ class ParallelStiffness(Effect):
         free_shapes=("rest",),
         excitation="slow_ramps",
     )
-    stiffness: Tensor
-    rest: Tensor
 
     def on_joint(self, q: Tensor, qd: Tensor) -> Tensor:
         """Return the spring's torque."""

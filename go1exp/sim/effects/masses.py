@@ -30,7 +30,6 @@ class Armature(Effect):
         nominal=True, rank=3, confounded=("kp_scale", "link_mass", "strength"), separated_by=TWO_GAIN_SETS
     )
     fields = ("dof_armature",)
-    added: Tensor
 
     def edit_model(self, model: ModelFields) -> None:
         """Add to the joints' own inertia."""
@@ -54,9 +53,6 @@ class ComOffset(Effect):
     )
     identification = Identification(nominal=True, rank=21, needs_ground=True, excitation="squat")
     fields = ("body_ipos",)
-    x: Tensor
-    y: Tensor
-    z: Tensor
 
     def edit_model(self, model: ModelFields) -> None:
         """Shift it."""
@@ -85,9 +81,6 @@ class LinkCom(Effect):
         nominal=True, rank=7, confounded=("base_tilt", "encoder_offset"), separated_by=TWO_ATTITUDES
     )
     fields = ("body_ipos",)
-    along: Tensor
-    forward: Tensor
-    left: Tensor
 
     def edit_model(self, model: ModelFields) -> None:
         """Shift it."""
@@ -106,7 +99,6 @@ class LinkInertia(Effect):
     title = "a change of link inertia"
     params = (Param("scale", "-", 0.5, 2.0, 1.0, 0.1, "joint", "inertia over the model's"),)
     fields = ("body_inertia",)
-    scale: Tensor
 
     def edit_model(self, model: ModelFields) -> None:
         """Scale it."""
@@ -132,7 +124,6 @@ class LinkMass(Effect):
         separated_by=TWO_GAIN_SETS,
     )
     fields = ("body_mass", "body_inertia")
-    scale: Tensor
 
     def edit_model(self, model: ModelFields) -> None:
         """Scale both."""
@@ -169,10 +160,6 @@ class Payload(Effect):
     )
     fields = FIELDS
     order = 10  # after a shift of the trunk's own centre
-    mass: Tensor
-    x: Tensor
-    y: Tensor
-    z: Tensor
 
     def edit_model(self, model: ModelFields) -> None:
         """Join the point mass to the trunk."""
@@ -206,10 +193,6 @@ class PointLoad(Effect):
     )
     fields = FIELDS
     order = 10  # after what changes the link's own mass and centre
-    mass: Tensor
-    x: Tensor
-    y: Tensor
-    z: Tensor
 
     def edit_model(self, model: ModelFields) -> None:
         """Join it to the link."""

@@ -36,7 +36,6 @@ class Strength(Effect):
         separated_by=TWO_GAIN_SETS,
     )
     order = 10
-    scale: Tensor
 
     def on_actuator(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
         """Return the torque made."""
@@ -58,8 +57,6 @@ class StrengthDrift(Effect):
     )
     memory = ("_time",)
     order = 20
-    rate: Tensor
-    floor: Tensor
 
     def __init__(self, setup: ActuatorSetup, **values: JointValues) -> None:
         """Begin an episode."""
@@ -115,9 +112,6 @@ class TorqueSpeedLimit(Effect):
         excitation="steps",
     )
     order = 50
-    peak: Tensor
-    droop: Tensor
-    stall: Tensor
 
     def on_actuator(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
         """Return the torque within the limits."""

@@ -10,10 +10,11 @@ from torch import Tensor
 
 from go1exp.config.schema.joint_values import spread
 from go1exp.config.schema.registry import Term
-from go1exp.robot.actuators import ActuatorSetup, CompiledModel, ModelFields
+from go1exp.robot.actuators import ActuatorSetup, ModelFields
 from go1exp.sim.actuator.motors import Actuator, HasGains
 from go1exp.sim.effects.base import Effect, Gears, Measured
 from go1exp.sim.effects.gears import TwoMass
+from go1exp.sim.physics.backend import PhysicsBackend
 
 HOOKS = (
     *("on_target", "on_feedforward", "on_encoder", "on_error", "on_gains", "on_actuator", "on_report"),
@@ -24,7 +25,7 @@ HOOKS = (
 class _Fields:
     """Model fields under construction: the compiled values, changed by one effect after the other."""
 
-    def __init__(self, model: CompiledModel, names: Sequence[str]) -> None:
+    def __init__(self, model: PhysicsBackend, names: Sequence[str]) -> None:
         self._model, self.ids, n = model, model.ids, model.num_envs
         compiled = {name: model.compiled(name) for name in names}
         self.values = {name: value.unsqueeze(0).repeat(n, *[1] * value.dim()) for name, value in compiled.items()}
@@ -84,7 +85,7 @@ class EffectStack:
                 drawn = (centre + widths[p.name] * unit.to(live.dtype)).clamp(p.smallest, p.high)
                 live.copy_(torch.where(named, drawn, centre))
 
-    def model_values(self, model: CompiledModel) -> dict[str, Tensor]:
+    def model_values(self, model: PhysicsBackend) -> dict[str, Tensor]:
         """Return the fields (N, ...) of a model with all effects in them, from those without any."""
         fields: ModelFields = _Fields(model, self.fields)
         for effect in self._acting["edit_model"]:

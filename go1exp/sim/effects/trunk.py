@@ -50,8 +50,6 @@ class BaseTilt(Effect):
         separated_by=TWO_ATTITUDES,
     )
     fields = ("opt.gravity",)
-    roll: Tensor
-    pitch: Tensor
 
     def edit_model(self, model: ModelFields) -> None:
         """Turn gravity about a held trunk."""
@@ -99,12 +97,6 @@ class ExternalWrench(Effect):
         Param("yaw", "N m", -10.0, 10.0, 0.0, 0.2, "robot", "about z"),
     )
     identification = Identification(needs_ground=True, excitation="squat")
-    x: Tensor
-    y: Tensor
-    z: Tensor
-    roll: Tensor
-    pitch: Tensor
-    yaw: Tensor
 
     def on_base(self, wrench: Tensor) -> Tensor:
         """Add force and torque."""
@@ -159,11 +151,6 @@ class SoftMount(Effect):
     )
     mounts = True
     order = 1  # after those that change masses and gravity
-    sway: Tensor
-    heave: Tensor
-    roll: Tensor
-    pitch: Tensor
-    damping: Tensor
 
     def __init__(self, setup: ActuatorSetup, **values: JointValues) -> None:
         """Leave the model as it is where there is no mount in it."""

@@ -16,10 +16,11 @@ import torch
 from torch import Tensor
 
 from go1exp import robot
+from go1exp.base.tensors.memory import Memory
 from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.base.tensors.rotation import projected_gravity, rotate_inverse
 from go1exp.config.schema.training import Value
-from go1exp.mdp.commands import UniformVelocity, WideningVelocity
+from go1exp.mdp.commands import UniformVelocity
 from go1exp.mdp.curricula import TrackedPath
 from go1exp.mdp.derived import clipped, joint_target, of_shape
 from go1exp.mdp.feet import Feet
@@ -179,8 +180,9 @@ class Go1Core:
     def reseed(self, seed: int) -> None:
         """Make the next ``reset`` the first one of an environment built with ``seed``."""
         self.random.reseed(seed)
-        if isinstance(self.command, WideningVelocity):
-            self.command.age.zero_()
+        for part in (self.command, *self.events.values()):
+            if isinstance(part, Memory):
+                part.renew()
         self._started = False
 
     def _randomize_model(self, when: str, mask: Tensor) -> None:
@@ -207,7 +209,8 @@ class Go1Core:
         if self._held is None:
             lift(fresh, self._ground if self._bounded else None)
         self.backend.reset(mask, qpos, qvel)
-        self.path.begin(mask, fresh.base_pos_w.float(), fresh.base_quat_w.float())
+        if self._curriculum:
+            self.path.begin(mask, fresh.base_pos_w.float(), fresh.base_quat_w.float())
         for part in (self.feet, self.gait_log, self.terms):
             part.reset(mask)
         for tensor in (self.action, self.previous_action, self.joint_acc):
@@ -240,7 +243,8 @@ class Go1Core:
         if self._curriculum:
             self.path.advance(self.task.sim.policy_dt, s.command, self._state.base_pos_w.float(), s.base_quat_w)
         terminated = self.terms.terminated(s)
-        cut = self.terms.cut_short(self._off_map(), s)
+        xy, (low, high) = self._state.base_pos_w[:, :2], self._map
+        cut = self.terms.cut_short(((xy < low) | (xy > high)).any(-1), s)
         truncated = ((self.steps >= self.task.sim.episode_steps) | cut) & ~terminated
         reward = self.terms.reward(s)
         self.episode_return += reward
@@ -283,11 +287,6 @@ class Go1Core:
         self.command.advance(self.task.sim.policy_dt, restart)
         for happening in self.events.values():
             happening.advance(self._state, self.task.sim.policy_dt, restart)
-
-    def _off_map(self) -> Tensor:
-        """(N,) bool: at the edge of a height field, beyond which there is no ground."""
-        xy, (low, high) = self._state.base_pos_w[:, :2], self._map
-        return ((xy < low) | (xy > high)).any(-1)
 
     def _move_levels(self, ended: Tensor, fallen: Tensor) -> None:
         """Apply the curriculum to the episodes that ended."""
@@ -381,9 +380,10 @@ class Go1Core:
 
     def _parts(self) -> dict[str, Any]:
         """Everything with a state of its own."""
-        names = ("backend", "random", "plant", "command", "feet", "gait_log", "task_log", "path")
+        names = ("backend", "random", "plant", "command", "feet", "gait_log", "task_log")
+        path = {"path": self.path} if self._curriculum else {}
         events = {f"event.{name}": part for name, part in self.events.items()}
-        return {**{name: getattr(self, name) for name in names}, **events, **self.terms.parts()}
+        return {**{name: getattr(self, name) for name in names}, **path, **events, **self.terms.parts()}
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything needed to continue bit for bit."""

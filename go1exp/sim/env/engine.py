@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from go1exp.base.tensors.randomness import EnvRandom
-from go1exp.config.schema.physics import BackendConfig, CpuBackend, PhysxBackend, WarpBackend
+from go1exp.config.schema.physics import BackendConfig, PhysxBackend, WarpBackend
 from go1exp.mdp.types import StepResult
 from go1exp.sim.physics.backend import PhysicsBackend
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu
@@ -25,41 +25,23 @@ def make_backend(config: BackendConfig, model: Any, sensors: Sensors, num_envs: 
         go1exp.config.schema.registry.Expected: if its packages are not installed.
         go1exp.config.schema.registry.ConfigError: if its device is not there.
     """
-    return BUILDERS[config.name](config, model, sensors, num_envs)
+    if isinstance(config, WarpBackend):
+        from go1exp.sim.physics.mujoco_warp import MujocoWarp  # its packages are an extra
 
+        limits = {"nconmax": config.nconmax, "njmax": config.njmax}
+        return MujocoWarp(model, sensors, num_envs, device=config.device, **limits)
+    if isinstance(config, PhysxBackend):
+        from go1exp.sim.physics.physx import PhysxCpu  # its package is an extra
 
-def _cpu(config: CpuBackend, model: Any, sensors: Sensors, num_envs: int) -> PhysicsBackend:
+        return PhysxCpu(model, sensors, num_envs, config)
     return MujocoCpu(model, sensors, num_envs, config.threads)
-
-
-def _warp(config: WarpBackend, model: Any, sensors: Sensors, num_envs: int) -> PhysicsBackend:
-    from go1exp.sim.physics.mujoco_warp import MujocoWarp  # its packages are an extra
-
-    limits = {"nconmax": config.nconmax, "njmax": config.njmax}
-    return MujocoWarp(model, sensors, num_envs, device=config.device, **limits)
-
-
-def _physx(config: PhysxBackend, model: Any, sensors: Sensors, num_envs: int) -> PhysicsBackend:
-    from go1exp.sim.physics.physx import PhysxCpu  # its package is an extra
-
-    return PhysxCpu(model, sensors, num_envs, config)
-
-
-BUILDERS: dict[str, Callable[..., PhysicsBackend]] = {"cpu": _cpu, "warp": _warp, "physx": _physx}
-"""How each engine is built, by the names of ``go1exp.config.schema.physics.BACKENDS``."""
-
-
-class Captures(Protocol):
-    """A backend that can record what is done to its device and repeat it at once."""
-
-    def capture(self, work: Callable[[], T]) -> tuple[Callable[[], None], T]:
-        """Run ``work`` a few times, record it, and return the replay and what ``work`` returned, live."""
 
 
 class Steps(Protocol):
     """An environment whose step may be part of a graph."""
 
     backend: Any
+    """With ``capture``, as ``MujocoWarp`` has it."""
 
     def step_by_call(self, action: Tensor) -> StepResult:
         """Step."""
@@ -77,9 +59,8 @@ def captured(env: Steps, work: Callable[[], T]) -> tuple[Callable[[], None], T]:
     Returns:
         the replay, and what ``work`` returned, written anew by each replay.
     """
-    backend: Captures = env.backend
     state = env.state_dict()
-    recorded = backend.capture(work)
+    recorded: tuple[Callable[[], None], T] = env.backend.capture(work)
     env.load_state_dict(state)
     return recorded
 

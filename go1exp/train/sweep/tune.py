@@ -7,13 +7,11 @@ database and the folder.
 
 from __future__ import annotations
 
-import csv
-import math
 import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,7 +23,7 @@ from go1exp.base.errors import Expected
 from go1exp.base.files import write_json
 from go1exp.config.schema.registry import Count
 from go1exp.config.schema.settings import settings
-from go1exp.config.schema.training import EVALUATED, ROWS
+from go1exp.train.early_stop import file_of, logged
 from go1exp.train.sweep import index, trials
 from go1exp.train.sweep.command import CORES, PARENT, Command, Ended, Running
 from go1exp.train.sweep.launchers import shares
@@ -213,7 +211,7 @@ class Search:
             result = f"{values[-1][1]:.5g}"
         else:
             study.tell(trial, state=optuna.trial.TrialState.FAIL)
-            result = f"failed ({how.cause or f'{self._column[0]} has no {self.settings.metric}'})"
+            result = f"failed ({how.cause or f'{file_of(self.settings.metric)} has no {self.settings.metric}'})"
         with self._lock:
             self._write(study)
             words = " ".join(f"{key}={value}" for key, value in drawn.items())
@@ -245,17 +243,9 @@ class Search:
         self._running.pop(trial.number, None)
         return ended[0], self._values(run), hopeless
 
-    @property
-    def _column(self) -> tuple[str, str]:
-        """Return the file of a run folder that has the metric, and the metric's column."""
-        metric = self.settings.metric
-        return (ROWS, metric.removeprefix(EVALUATED)) if metric.startswith(EVALUATED) else ("metrics.csv", metric)
-
     def _values(self, run: Path) -> list[tuple[int, float]]:
         """Return iteration and averaged metric, at each row that has the metric."""
-        file, column = self._column
-        rows = list(_rows(run / file, column))
-        newest = self.settings.average
+        rows, newest = list(logged(run, self.settings.metric)), self.settings.average
         return [
             (iteration, sum(v for _, v in rows[max(0, k + 1 - newest) : k + 1]) / min(k + 1, newest))
             for k, (iteration, _) in enumerate(rows)
@@ -293,18 +283,3 @@ STATES: dict[str, tuple[index.JobState, str]] = {
     "FAIL": ("failed", ""),
 }
 """Optuna's state of a trial -> that of a job, and its cause."""
-
-
-def _rows(path: Path, metric: str) -> Iterator[tuple[int, float]]:
-    """Yield iteration and value of the rows that have one; a row half written has none yet."""
-    try:
-        text = path.read_text()
-    except OSError:
-        return
-    for row in csv.DictReader(text[: text.rfind("\n") + 1].splitlines()):
-        try:
-            iteration, value = int(row["iteration"]), float(row[metric] or "nan")
-        except (KeyError, ValueError, TypeError):
-            continue
-        if math.isfinite(value):
-            yield iteration, value
