@@ -23,7 +23,9 @@ from go1exp.cli.record import AUDIT
 from go1exp.config.schema import registry
 from go1exp.logs import excitations
 from go1exp.logs.audit import AuditReport, audit, audit_file, clock_flaws, signals
+from go1exp.logs.audit.copies import copies
 from go1exp.logs.audit.impossible import impossible, without
+from go1exp.logs.audit.signals import Log
 from go1exp.logs.recording import Recording, RecordingError, joint_channels, write
 from go1exp.robot import EFFORT_LIMIT, JOINT_POS_LIMITS, JOINTS, NOMINAL_STANCE, per_joint, soft_limits
 from tests.made import meta as made_meta
@@ -43,6 +45,7 @@ META = made_meta(
 
 
 STOPS = JOINT_POS_LIMITS
+TORQUES = joint_channels("tau_est", JOINTS)
 
 
 def respond(
@@ -882,3 +885,63 @@ def test_rows_that_their_neighbours_rule_out_are_named_and_left_out() -> None:
     wrapped = np.where(np.arange(ROWS) < 800, 2 * np.pi, 0.0) + r.channels["q_FL_calf"]
     np.testing.assert_array_equal(impossible(with_(r, q_FL_calf=wrapped)).rows, np.arange(ROWS) < 800)
     assert len(without(zeros, lost).t) == ROWS - 4
+
+
+def _written(r: Recording, wrong: str) -> dict[str, np.ndarray]:
+    """Columns of the joint FR_hip as a faulty logger computes them."""
+    q, target, qd = (r.channels[f"{kind}_FR_hip"] for kind in ("q", "q_target", "qd"))
+    step = np.diff(q) / np.diff(r.t)
+    law = 20.0 * (target - q) - 0.5 * qd
+    measured = {c: r.channels[c].copy() for c in joint_channels("tau_est", JOINTS)}
+    commands = {c.replace("est", "cmd"): values for c, values in measured.items()}
+    return {
+        "target": {"q_target_FR_hip": q.copy()},
+        "target next": {"q_target_FR_hip": np.append(q[1:], 0.0)},
+        "target in degrees": {"q_target_FR_hip": np.degrees(q)},
+        "half of a target": {"q_target_FR_hip": np.where(np.arange(ROWS) < 1500, q, target)},
+        "angle": {"q_FR_hip": r.channels["q_FL_thigh"].copy()},
+        "difference": {"qd_FR_hip": np.append(0.0, step)},
+        "central difference": {"qd_FR_hip": np.gradient(q, r.t)},
+        "mean difference": {"qd_FR_hip": np.append(np.zeros(3), 0.5 * (step[1:-1] + step[:-2]))},
+        "torque": commands,
+        "torque late": {c: np.append(values[1:], 0.0) for c, values in commands.items()},
+        "torque of a constant": {c: 1.7 * values for c, values in commands.items()},
+        "law": {"tau_est_FR_hip": np.clip(law, *np.quantile(law, (0.05, 0.95)))},
+    }[wrong]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "column", "verdict"),
+    [
+        ("target", "q_target_FR_hip", "bad"),
+        ("target next", "q_target_FR_hip", "bad"),
+        ("target in degrees", "q_target_FR_hip", "bad"),
+        ("half of a target", "q_target_FR_hip", "bad"),
+        ("angle", "q_FR_hip", "bad"),
+        ("difference", "qd_FR_hip", "suspect"),
+        ("central difference", "qd_FR_hip", "suspect"),
+        ("mean difference", "qd_FR_hip", "suspect"),
+        ("torque", "tau_est_FR_hip", "suspect"),
+        ("torque late", "tau_est_FR_hip", "suspect"),
+        ("torque of a constant", "tau_est_FR_hip", "suspect"),
+        ("law", "tau_est_FR_hip", "suspect"),
+    ],
+)
+def test_a_column_that_holds_another_quantity_is_named(wrong: str, column: str, verdict: str) -> None:
+    sound = realistic(made("gait"))
+    found = {f.channel: f for f in copies(Log(with_(sound, **_written(sound, wrong))))}
+    assert found[column].verdict == verdict
+    assert "%" in found[column].message
+    if "torque" not in wrong:
+        assert set(found) == {column}
+
+
+def test_what_follows_closely_and_what_is_ideal_is_no_copy() -> None:
+    """Another sensor of the same quantity has noise of its own; in an ideal simulation columns agree."""
+    sound, ideal = realistic(made("gait")), made("gait")
+    rng = np.random.default_rng(3)
+    follows = {c.replace("est", "cmd"): sound.channels[c] + rng.normal(0.0, 0.03, ROWS) for c in TORQUES}
+    assert not list(copies(Log(with_(sound, **follows))))
+    equal = {c.replace("est", "cmd"): ideal.channels[c].copy() for c in TORQUES}
+    slopes = {c.replace("q_", "qd_"): np.gradient(ideal.channels[c], ideal.t) for c in joint_channels("q", JOINTS)}
+    assert all(f.verdict == "ok" for f in copies(Log(with_(ideal, **equal, **slopes))))

@@ -246,6 +246,17 @@ def test_wrong_settings_are_refused(wrong: dict[str, Any], message: str) -> None
 # ---------------------------------------------------------------------- training
 
 
+def test_a_torque_that_is_the_command_is_refused_by_name(recordings: list[Recording]) -> None:
+    """A net would reproduce the command to the last digit and say nothing of the actuator."""
+    *others, last = recordings
+    commanded = {f"tau_cmd_{joint}": last.channels[f"tau_est_{joint}"].copy() for joint in JOINTS}
+    with pytest.raises(FitError, match=rf"{last.meta.episode}: tau_est_\w+ equals tau_cmd_\w+ in 100.0%"):
+        fit([*others, Recording(last.meta, last.channels | commanded)], QUICK)
+    measured = {f"q_target_{joint}": last.channels[f"q_{joint}"].copy() for joint in JOINTS}
+    with pytest.raises(FitError, match=r"q_target_\w+ equals q_\w+ in 100.0%.*in the place of the target"):
+        fit([*others, Recording(last.meta, last.channels | measured)], QUICK)
+
+
 def test_the_net_beats_every_reference_on_a_drive_that_lags_and_saturates(result: FitResult) -> None:
     cell = result.report.cell()
     assert set(cell.rmse) == {"net", "command", "pd", "linear", "half_net"}

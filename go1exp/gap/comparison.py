@@ -125,7 +125,12 @@ def prepare(recordings: Sequence[Recording], robot: Robot, settings: GapSettings
     if not good or (lines and (len(good) < FEWEST_RECORDINGS or 2 * len(good) < len(recordings))):
         sentence = f"These logs cannot be compared with the model: {'; '.join(lines[:3])}."
         raise NotComparable(sentence, lines, lines)
-    ready = robot.prepared([recordings[k] for k in good], [reports[k] for k in good], settings)
+    kept = [reports[k] for k in good]
+    copied = [f for report in kept for f in report.by_check("copy") if f.channel.startswith("tau_est_")]
+    if settings.torque and copied:
+        settings = replace(settings, torque=False)
+        removed.append(f"tau_est: {copied[0].channel} {copied[0].message}")
+    ready = robot.prepared([recordings[k] for k in good], kept, settings)
     omitted = (f"Left out: {line}." for line in (*removed, *lines))
     return robot, Ready(ready.recordings, ready.settings, ready.ignored, (*omitted, *ready.warnings))
 

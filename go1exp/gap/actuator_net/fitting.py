@@ -20,6 +20,8 @@ from go1exp.gap.actuator_net.dataset import JointTorque, Rows, Split, fingerprin
 from go1exp.gap.actuator_net.report import Reference, Report, linear, recorded, report, rmse, thresholds
 from go1exp.gap.actuator_net.settings import FitError, FitSettings
 from go1exp.gap.actuator_net.train import Trained, train
+from go1exp.logs.audit.copies import copies
+from go1exp.logs.audit.signals import Log
 from go1exp.logs.recording import Recording
 from go1exp.sim.actuator.actuator_net import ActuatorNet, NetInfo, Provenance, group_names
 
@@ -73,6 +75,7 @@ def fit(
         RecordingError: if one has no channel that the inputs or the target need.
     """
     robot, joints, period = _common(recordings, settings)
+    _refuse_copies(recordings, settings)
     parts = split(recordings, settings.holdout, settings.validation, settings.seed)
     episodes = tuple(r.meta.episode for r in recordings)
     rows = windows(
@@ -240,6 +243,18 @@ def _common(recordings: Sequence[Recording], settings: FitSettings) -> tuple[str
             "taps closer than that are not in the data"
         )
     return first.robot, first.joints, settings.period
+
+
+def _refuse_copies(recordings: Sequence[Recording], settings: FitSettings) -> None:
+    """Raise FitError if a torque to learn, or a target that the net reads, holds another quantity."""
+    needed = {"tau_est"} if settings.target == "tau_est" else set[str]()
+    needed |= {"q_target"} if "position_error" in settings.inputs else set()
+    for recording in recordings:
+        log = Log(recording)
+        for flaw in copies(log):
+            if log.quantity[flaw.channel] in needed:
+                what = f"{recording.meta.episode}: {flaw.channel} {flaw.message}"
+                raise FitError(f"{what}: a net would learn nothing of the actuator from it")
 
 
 def _sets(recordings: Sequence[Recording]) -> str:

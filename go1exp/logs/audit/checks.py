@@ -14,6 +14,7 @@ import go1exp.logs.audit.related as related
 import go1exp.logs.audit.signals as signals
 import go1exp.logs.audit.single as single
 from go1exp.logs.audit.commands import Delay
+from go1exp.logs.audit.copies import copies
 from go1exp.logs.audit.impossible import impossible
 from go1exp.logs.audit.report import ORDER, AuditReport, Channel, Finding, worst
 from go1exp.logs.audit.signals import Log, finding
@@ -88,6 +89,7 @@ def _run_checks(log: Log) -> tuple[list[Finding], _Measured]:
         *related.torque(log),
         *related.rotation(log),
         *related.gravity(log),
+        *copies(log),
         *commands.order_and_sign(log),
         *delay_findings,
     ]

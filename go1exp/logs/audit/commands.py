@@ -85,7 +85,7 @@ def _controller_law(log: Log) -> np.ndarray:
     target, tau = r.joint("q_target"), r.joint("tau_est")
     for j in range(len(signs)):
         best = limits.LAW
-        if abs(_correlation(target[:, j], motion[:, j, 0])) > limits.ALIKE:
+        if abs(signals.correlation(target[:, j], motion[:, j, 0])) > limits.ALIKE:
             continue  # then their factors cannot be separated
         for lag in range(0, log.samples(limits.TORQUE_LAG) + 1, log.samples(0.002)):
             now = np.flatnonzero(log.on[lag:]) + lag
@@ -98,12 +98,6 @@ def _controller_law(log: Log) -> np.ndarray:
             ):
                 best, signs[j] = explained, -np.sign(factors[0] * factors[1])
     return signs
-
-
-def _correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the correlation of two series (T,), 0 where one is constant."""
-    a, b = a - a.mean(), b - b.mean()
-    return float(a @ b / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12))
 
 
 def _other_unit(joint: str, times: float) -> Iterator[Finding]:

@@ -139,6 +139,20 @@ POSITION_MARGIN = (0.08, 0.3)
 EXCEEDED = 1.25
 """Torque and speed may exceed their limit by this factor: limits are nominal; an ideal actuator has no speed limit."""
 
+# ---------------------------------------------------------------------- columns that hold another quantity
+
+COPIED = 0.15
+"""Share of the rows in which two columns change where they are equal (chosen: 0.07 of coarse torques are by chance)."""
+COPY_ROWS = 4000
+"""Rows by which most pairs of columns are told apart."""
+DERIVED, SAME_NOISE = 0.8, 0.3
+"""Share of rows in which a channel is so near to what an angle gives, in standard deviations of the angle's noise
+in it. Of an independent reading 0.24 are."""
+FITTED, LAW_ROWS = 0.7, 3
+"""Share of the rows that a law of a copy is fitted to (others may be clipped), and rows by which it may be late."""
+IDEAL = 3e-6
+"""Noise of a channel over its range below which no sensor read it."""
+
 # ---------------------------------------------------------------------- samples that neighbours rule out
 
 FASTEST = 60.0

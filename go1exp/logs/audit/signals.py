@@ -157,6 +157,12 @@ def scale(reference: np.ndarray, other: np.ndarray, blocks: int = 10) -> Scale |
     return Scale(factor(total), float(spread), float(total[1] / np.sqrt(total[0] * total[2])))
 
 
+def correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the correlation of two series (T,), 0 where one is constant."""
+    a, b = a - a.mean(), b - b.mean()
+    return float(a @ b / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12))
+
+
 def antiderivative(t: np.ndarray, rate: np.ndarray) -> np.ndarray:
     """Integrate a cubic spline through ``rate`` (T, ...) from the first sample to each."""
     return CubicSpline(t, rate, axis=0).antiderivative()(t)
