@@ -111,7 +111,6 @@ class VelocityFilters:
         self._filters.restart(env)
 
     def _update(self, target: Tensor) -> None:
-        """Update every filter with a sample, before a step."""
         if self._observer is not None:
             self._observer(target)
         true = {name: values.cpu().numpy() for name, values in sample(self._plant, target).items()}

@@ -279,7 +279,6 @@ class _Tally:
         return torch.tensor(sorted(by_figures.values()))
 
     def _falls(self, robots: torch.Tensor) -> dict[str, Any]:
-        """Return falls of different robots, and their share with its 95 % interval."""
         return {"count": int(self.fell[robots].sum()), **share(int(self.fell[robots].sum()), len(robots))}
 
     def _row(self, k: int, command: Command, config: EvalConfig) -> dict[str, Any]:

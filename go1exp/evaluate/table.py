@@ -47,12 +47,10 @@ def _phases(entry: Any) -> str:
 
 
 def _most(entry: Any) -> str:
-    """Return the most frequent name."""
     return next(iter(entry or {}), NO_FIGURE)
 
 
 def _any(entry: Any) -> str:
-    """Return a measure of any kind as text."""
     return _numbers(".3g")(entry) if entry is None or "mean" in entry else _most(entry)
 
 
@@ -186,7 +184,6 @@ def _falls(report: dict[str, Any]) -> str:
 
 
 def _delay(report: dict[str, Any]) -> str:
-    """Return the delay margin."""
     margin = report["delay_margin"]
     runs = ", ".join(f"{ms} ms {f['count']} of {f['n']}" for ms, f in margin["falls"].items())
     held = "none: robots fall without delay" if margin["ms"] is None else f"{margin['ms']} ms"

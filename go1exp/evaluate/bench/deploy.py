@@ -81,7 +81,6 @@ def run(
 
 
 def _jitter(idle: Timing) -> dict[str, float]:
-    """Return the timing of a loop without work."""
     return {"idle_missed_400hz": 100.0 * idle.missed_share, "idle_period_p99_ms": 1e3 * idle.period_p99}
 
 
@@ -162,8 +161,6 @@ COMMANDS = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 1.0))
 
 
 class _Timed:
-    """A controller whose calls are timed."""
-
     def __init__(self, inner: Mpc, times: list[float]) -> None:
         self.inner, self.period, self._times = inner, inner.period, times
 

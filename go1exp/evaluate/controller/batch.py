@@ -107,7 +107,6 @@ class Driven:
         return self._target, self._forward, self._kp, self._kd, self._core.backend.sensordata
 
     def _step(self) -> None:
-        """Call the controllers when they are due, and advance the physics."""
         sensed = self._sense()
         if self._steps % self._every == 0:
             commands = self._core.command.value.double().numpy()
@@ -121,7 +120,6 @@ class Driven:
         self._core.target.copy_(self._target)
 
     def _apply(self, commands: Sequence[LowCmd]) -> None:
-        """Apply the controllers' commands."""
         rows = [(self._target, [one.joint_target for one in commands])]
         self._feeds = commands[0].feedforward is not None  # all are of one kind
         if self._feeds:
@@ -134,7 +132,6 @@ class Driven:
             self._plant.set_gains(self._kp, self._kd)
 
     def _sense(self) -> list[Sensed]:
-        """Read the sensors of all robots."""
         true = {name: values.cpu().double().numpy() for name, values in sample(self._plant, self._target).items()}
         readings = noisy(true, self._noise, self._rng)
         if self._estimates:

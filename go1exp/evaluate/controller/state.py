@@ -134,7 +134,6 @@ class Ground:
         self._fresh = False
 
     def _limited(self, gradient: np.ndarray) -> np.ndarray:
-        """Return a gradient limited to the steepest one."""
         steepest, most = math.hypot(*gradient.tolist()), math.tan(self._settings.max_slope)
         return gradient if steepest <= most else gradient * (most / steepest)
 

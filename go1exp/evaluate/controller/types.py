@@ -97,7 +97,6 @@ class Deployed:
     """A controller in the runtime's loop, which must run at its rate, in place of a bundle's policy."""
 
     def __init__(self, controller: Controller) -> None:
-        """Walk by ``controller``."""
         self._controller = controller
 
     def step(self, velocity: np.ndarray, state: LowState, base_lin_vel: np.ndarray) -> LowCmd:

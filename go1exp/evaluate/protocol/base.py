@@ -213,7 +213,6 @@ class CompareSettings:
     folder: Annotated[str, Field(min_length=1)]
 
     def __post_init__(self) -> None:
-        """Check settings against each other."""
         if len(set(self.subjects)) < len(self.subjects):
             raise ValueError(f"subjects = {list(self.subjects)}: each only once")
 

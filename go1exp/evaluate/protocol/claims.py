@@ -35,7 +35,6 @@ class Claim:
     source: str
 
     def __post_init__(self) -> None:
-        """Check settings against each other."""
         if self.at_least is None and self.at_most is None:
             raise ValueError("at_most = None: a claim needs at_most or at_least")
 
@@ -120,7 +119,6 @@ def _excess(value: float, claim: Claim) -> float:
 
 
 def _both_sides(figure: Interval, claim: Claim) -> bool:
-    """Return whether an interval contains both limits."""
     if claim.at_least is None or claim.at_most is None:
         return False
     return figure.low < claim.at_least and figure.high > claim.at_most

@@ -148,7 +148,6 @@ def _unit(name: str, entries: Sequence[Entry]) -> str:
 
 
 def _merged(entries: Sequence[Entry]) -> list[Entry]:
-    """Return one entry for each condition, with all its quantities."""
     merged: dict[tuple[Any, ...], dict[str, Any]] = {}
     for entry in entries:
         one = merged.setdefault(tuple(entry["condition"].items()), {"condition": entry["condition"], "figures": {}})
@@ -301,7 +300,6 @@ def _verdicts(differences: Mapping[str, Sequence[Difference]]) -> list[tuple[str
 
 
 def _counts(differences: Mapping[str, Sequence[Difference]]) -> Table:
-    """Return how many quantities of each subject have each verdict."""
     rows = []
     for key, those in differences.items():
         for subject in dict.fromkeys(d.subject for d in those):

@@ -144,7 +144,6 @@ class Session:
     """A plan that is played piece by piece, and that can return to a saved state."""
 
     def __init__(self, stage: Stage, plan: Plan) -> None:
-        """Build the robots and put them at the start."""
         self._stage, self.plan = stage, plan
         self._velocity = plan.trunk_velocity or stage.setting.trunk_velocity
         task, seed = stage.task(plan), stage.setting.seed

@@ -179,7 +179,6 @@ def _differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
 
 
 def _settings(name: str, about: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings that comparable evaluations share."""
     if name == GRID:
         commands = [entry["command"] for entry in about["commands"]]
         return {**about["settings"], "robot": about.get("robot", {}), "commands": commands}

@@ -147,7 +147,6 @@ def _figure(
 
 
 def _values(evaluation: Evaluation, group: Group, column: Column, rows: Rows | None = None) -> list[Floats]:
-    """Return the defined values of each run of a group."""
     values = []
     for folder in (run.folder for run in group.runs):
         each = evaluation.runs[folder].table.get(column.name) if folder in evaluation.runs else None
@@ -270,7 +269,6 @@ def _corrected(source: Literal["setting", "drawn"], column: Column, those: Seque
 
 
 def _of_settings(evaluation: Evaluation, made: Sequence[Group], column: Column) -> list[Association]:
-    """Return the correlation of each swept key with a quantity of runs."""
     if len(made) < 2:
         return []
     values = np.concatenate([_means(_values(evaluation, group, column)) for group in made])

@@ -48,7 +48,6 @@ class EvaluationSettings:
     checkpoint: Literal["newest", "best"]
 
     def __post_init__(self) -> None:
-        """Check what concerns two settings."""
         if self.settle_s >= self.duration_s:
             raise ValueError(f"settle_s = {self.settle_s}: must be shorter than duration_s = {self.duration_s}")
 

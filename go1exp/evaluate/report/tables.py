@@ -85,7 +85,6 @@ def _interval(interval: Interval | None, note: str = "") -> Cell | str:
 
 
 def _verdicts(outcome: Outcome, baseline: str) -> Table:
-    """Return the comparisons with the baseline, significant differences first."""
     rows = []
     for v in sorted(outcome.verdicts, key=lambda v: ORDER.index(v.word)):
         d = v.difference
@@ -115,7 +114,6 @@ def _verdicts(outcome: Outcome, baseline: str) -> Table:
 
 
 def _figures(outcome: Outcome, made: Report) -> Table:
-    """Return the main quantities of each group."""
     evaluation = outcome.evaluation
     columns = [c for c in evaluation.columns if c.name in evaluation.main]
     others = [c for c in evaluation.columns if c.better and c.name not in evaluation.main]
@@ -204,7 +202,6 @@ def _figure_row(f: Figure) -> PlainRow:
 
 
 def _value_rows(outcome: Outcome, made: Report) -> list[PlainRow]:
-    """Return the quantities of each run, all conditions together."""
     rows = []
     for group in made.groups:
         figures = [f for f in outcome.figures if f.group == group.name]

@@ -64,7 +64,6 @@ class DriveWindow(Window):
     """
 
     def __init__(self, pad: Gamepad) -> None:
-        """Take commands from panels, keys and ``pad``."""
         super().__init__("Robot", "Curves")
         self._command, self._pad, self._sticks = [0.0, 0.0, 0.0], pad, False
         self._push = PushPanel(self.ask)
@@ -141,7 +140,6 @@ class DriveWindow(Window):
         return [arrow_shape(arrow) for arrow in self.view.arrows]
 
     def _note(self, name: str) -> None:
-        """Note where the last control is."""
         low, high = imgui.GetItemRectMin(), imgui.GetItemRectMax()
         self.places[name] = (low.x, low.y, high.x, high.y)
 

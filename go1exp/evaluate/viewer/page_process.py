@@ -26,7 +26,6 @@ class Mailbox:
     """
 
     def __init__(self, pipe: Connection) -> None:
-        """Carry messages over ``pipe``."""
         self._pipe, self._free = pipe, True
         self.waiting: dict[type[messages.Snapshot], messages.Snapshot] = {}
         self._came: list[messages.Event] = []

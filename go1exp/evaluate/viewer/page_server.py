@@ -36,7 +36,6 @@ class Gate:
     """
 
     def __init__(self, port: int) -> None:
-        """Create a random token."""
         self.token = secrets.token_urlsafe(16)
         self._cookie = f"go1exp_{port}"  # cookies are shared by all ports of a host
 
@@ -155,7 +154,6 @@ class Gamepad:
     """State of the gamepad. The server's thread writes it, the window's reads it."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """Start without a gamepad."""
         self._clock, self._heard = clock, -math.inf
         self._axes: tuple[float, ...] = ()
         self._held: frozenset[int] = frozenset()

@@ -361,7 +361,6 @@ class ReplayShow:
         return STEP_S
 
     def _qpos(self, motion: Motion) -> Array:
-        """Return the coordinates of a motion now."""
         qpos = self.model.qpos0.copy()
         q, base = self.player.pose(motion)
         if self._free:

@@ -46,7 +46,6 @@ class ReplayWindow(Window):
     """Panels for a recording or an answer."""
 
     def __init__(self, story: Story) -> None:
-        """Tell a story."""
         super().__init__("Recording", "Curves")
         self._story = story
         self._joint = 0

@@ -196,7 +196,6 @@ class Session:
         self.rewards = names
 
     def _begin(self) -> None:
-        """Reset the robot to the start."""
         core, setup = self.core, self.setup
         ground = self.robots.grounds[setup.ground]
         self._aim()
@@ -209,7 +208,6 @@ class Session:
         self._fresh()
 
     def _aim(self) -> None:
-        """Set the environment's command."""
         self.core.command.value[:] = self.core.command.value.new_tensor(self.command)
 
     def _fresh(self) -> None:
@@ -272,7 +270,6 @@ class Session:
                 self.message = ""
 
     def _exchange(self, label: str, setup: Setup) -> None:
-        """Change policy or conditions while the robot moves."""
         old = self.core
         self._build(label, setup)
         self._aim()
@@ -322,7 +319,6 @@ class Session:
         self._remember()
 
     def _remember(self) -> None:
-        """Add a row to the curves."""
         s, core = self.core.snapshot(), self.core
         assert s.base_pos_w is not None
         assert s.base_lin_vel_b is not None

@@ -359,7 +359,6 @@ class Answering:
     """
 
     def __init__(self, probe: Probe, pipe: Connection) -> None:
-        """Answer from the next tick on."""
         self.going, self._probe, self._pipe = True, probe, pipe
         self._before, probe.server.on_tick = probe.server.on_tick, self._tick
 

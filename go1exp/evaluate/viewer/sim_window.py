@@ -104,7 +104,6 @@ class SimShow:
     """
 
     def __init__(self, link: Link, body: Body) -> None:
-        """Build the scene of the robot of ``link``."""
         self._link, self._body = link, body
         self._terrain = build_terrain(body.terrain)
         task = SimpleNamespace(robot=body.robot, sim=SimpleNamespace(physics_dt=TICK), contact=body.contact)
@@ -317,7 +316,6 @@ class SimWindow(Window):
             self._plots.plot("##torque", "-", view, lines, (0.0, 1.05), TALL)
 
     def _intervals(self, view: SimView) -> None:
-        """Draw a point for each packet of the last seconds."""
         if not implot.BeginPlot("##intervals", Vec2(-1.0, PACKETS), PLAIN | int(implot.Flags.NoTitle)):
             return
         implot.SetupAxes("", "ms", 0, 0)

@@ -141,7 +141,6 @@ class WalkShow:
     """A session in its scene."""
 
     def __init__(self, session: Session) -> None:
-        """Build the scene."""
         self.session = session
         self._effects = lines(session.robots.effects)
         self._core: Any = None

@@ -173,8 +173,6 @@ def _behind(gate: Gate, pad: Gamepad, sock: Any) -> Iterator[None]:
 
 
 class _Messenger(plugin.SimPlugin):
-    """Passes the window's requests on."""
-
     def __init__(self, show: Show) -> None:
         self._show = show
 
@@ -196,7 +194,6 @@ def _not_a_browser_that_left(record: logging.LogRecord) -> bool:
 def _opened(
     title: str, gate: Gate, pad: Gamepad, sock: Any, windows: list[plugin.ViewerPlugin], show: Show
 ) -> viewer_handle.ViewerHandle:
-    """Start Studio's viewer in a process of its own."""
     logging.getLogger("WebServer").setLevel(logging.WARNING)
     logging.getLogger("asyncio").addFilter(_not_a_browser_that_left)
 
@@ -270,7 +267,6 @@ def run(
 
 
 def _loop(handle: viewer_handle.ViewerHandle, show: Show) -> None:
-    """Advance in real time."""
     due = time.perf_counter()
     rate = PictureRate(due)
     while handle.is_running():

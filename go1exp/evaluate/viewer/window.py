@@ -120,7 +120,6 @@ class Window(plugin.ViewerPlugin):
             imgui.End()
 
     def _dock(self) -> None:
-        """Dock the panels, once."""
         flags = imgui.DockNodeFlags
         root = imgui.DockSpaceOverMainViewport(0, int(flags.PassthruCentralNode))
         if self._docked:
@@ -177,7 +176,6 @@ class PushPanel:
     """
 
     def __init__(self, send: Callable[[ask.Push], None]) -> None:
-        """Send pushes by ``send``."""
         self._send, self._impulse, self._direction = send, 20.0, 90.0
         self.places: dict[str, tuple[float, float, float, float]] = {}
 
@@ -221,7 +219,6 @@ class EffectsPanel:
     """Each effect on or off, and its size."""
 
     def __init__(self, send: Callable[[ask.SetEffects], None]) -> None:
-        """Send the selection by ``send``."""
         self._send, self._slider = send, ReleasedSlider()
 
     def draw(self, sizes: Mapping[str, float], texts: Mapping[str, str]) -> None:

@@ -47,7 +47,6 @@ class Hardware(Steady):
     )
 
     def __post_init__(self) -> None:
-        """Check settings against each other."""
         Steady.__post_init__(self)
         if sorted(set(self.delays_ms)) != list(self.delays_ms):
             raise ValueError(f"delays_ms = {list(self.delays_ms)}: must rise")

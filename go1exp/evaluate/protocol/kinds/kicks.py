@@ -96,7 +96,6 @@ class Kicks(Protocol):
     )
 
     def __post_init__(self) -> None:
-        """Check settings against each other."""
         if wrong := repeated("impulses", self.impulses):
             raise ValueError(wrong[0])
         if self.push_s > self.every_s:

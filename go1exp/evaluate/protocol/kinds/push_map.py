@@ -74,7 +74,6 @@ class PushMap(Protocol):
     )
 
     def __post_init__(self) -> None:
-        """Check settings against each other."""
         if self.push_s > self.watch_s:
             raise ValueError(f"push_s = {self.push_s}: must be at most watch_s = {self.watch_s}")
 

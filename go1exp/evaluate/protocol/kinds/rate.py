@@ -61,7 +61,6 @@ class Rate(Protocol):
     )
 
     def __post_init__(self) -> None:
-        """Check settings against each other."""
         wrong = repeated("rates_hz", self.rates_hz) + repeated("delays_ms", self.delays_ms)
         wrong += repeated("velocities", self.velocities)
         if self.settle_s >= self.duration_s:

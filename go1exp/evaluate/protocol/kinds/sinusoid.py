@@ -58,7 +58,6 @@ class Sinusoid(Protocol):
     robot_columns: ClassVar[tuple[Column, ...]] = _columns()
 
     def __post_init__(self) -> None:
-        """Check settings against each other."""
         if self.duration_s < 2.0 * self.longest:
             raise ValueError(f"duration_s = {self.duration_s}: must be at least two periods, {2 * self.longest:g}")
         if wrong := repeated("ladder", [f"{label(sine)} at {sine.period:g} s" for sine in self.ladder]):

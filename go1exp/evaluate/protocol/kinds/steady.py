@@ -45,7 +45,6 @@ class Steady(Protocol):
     keys: ClassVar[tuple[str, ...]] = AXES
 
     def __post_init__(self) -> None:
-        """Check settings against each other."""
         if not self.rest_s <= self.settle_s < self.duration_s:
             order = f"rest_s = {self.rest_s} and duration_s = {self.duration_s}"
             raise ValueError(f"settle_s = {self.settle_s}: must lie between {order}")

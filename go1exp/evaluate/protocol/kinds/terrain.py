@@ -65,7 +65,6 @@ class OnTerrain(Protocol):
     )
 
     def __post_init__(self) -> None:
-        """Check settings against each other."""
         wrong = [
             f"grounds.{name} = {list(levels)}: must rise"
             for name, levels in self.ladders.items()
@@ -96,7 +95,6 @@ class OnTerrain(Protocol):
         ]
 
     def _causes(self, speed: float) -> list[Cause]:
-        """Return what says how long robots have at a speed."""
         way, slack = goal() + 0.5, self.slack
 
         def pace(seconds: float) -> float:
