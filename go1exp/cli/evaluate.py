@@ -316,6 +316,7 @@ def _grid(
     """Play the grid of constant commands."""
     announce("evaluating")
     show = spinner(1, "evaluating")
+    from go1exp.config.schema.settings import subset
     from go1exp.evaluate import criteria, table
     from go1exp.evaluate.quantities import write as write_report
     from go1exp.evaluate.rollout import EvalConfig, delay_margin, evaluate, grid
@@ -330,7 +331,7 @@ def _grid(
         make = subjects.controller_maker(conditions.controller, task)
         about = {"controller": dataclasses.asdict(conditions.controller)}
     commands = grid(settings.grid.x, settings.grid.y, settings.grid.yaw, settings.grid.cross)
-    config = EvalConfig.from_settings(settings, commands=commands, engine=conditions.engine)
+    config = subset(EvalConfig, settings, commands=commands, engine=conditions.engine)
     task = subjects.with_robot(task, conditions.other)
     report = {
         "policy": about,

@@ -53,12 +53,13 @@ def _task(container: dict[str, Any]) -> None:
         writable_file(out)
         announce("recording a video")
 
+    from go1exp.config.schema.settings import subset
     from go1exp.evaluate.rollout import EvalConfig, evaluation_task, require_agreement
     from go1exp.sim.env.core import Go1Core
 
     drives = agent(subject, other)
     whole = {"episodes": 1, "duration_s": settings.seconds, "settle_s": 0.0, "policy_dt": None}
-    shown = EvalConfig.from_settings(settings, commands=(settings.velocity,), engine=engine, **whole)
+    shown = subset(EvalConfig, settings, commands=(settings.velocity,), engine=engine, **whole)
     shown_task = evaluation_task(drives.task, shown)
     if ground is not None:
         shown_task = dataclasses.replace(shown_task, terrain=ground)

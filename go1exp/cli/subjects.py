@@ -282,16 +282,16 @@ def agent(subject: Named, other: dict[str, Any], robot_of: TaskConfig | None = N
         task = _robot(parse_train(bundle.config).task, other, robot_of)
         trained = dataclasses.asdict(bundle.metadata.trained)
         about = {"bundle": str(subject.bundle), "sha256": bundle.seal, "trained": trained}
-        return BundleAgent(subject.label, task, bundle, about)
+        return BundleAgent(subject.label, task, bundle, about=about)
     assert subject.run is not None
     if subject.controller is not None:
         task, controller = _robot(task_of_run(subject.run), other, robot_of), subject.controller
         settings = {"controller": dataclasses.asdict(controller), "robot_of_run": str(subject.run)}
-        return ControllerAgent(subject.label, task, controller_maker(controller, task), settings)
+        return ControllerAgent(subject.label, task, controller_maker(controller, task), about=settings)
     from go1exp.train.policy import load_run
 
     of_run, policy, about = load_run(subject.run, subject.checkpoint)
-    return PolicyAgent(subject.label, _robot(of_run.task, other, robot_of), policy, about)
+    return PolicyAgent(subject.label, _robot(of_run.task, other, robot_of), policy, about=about)
 
 
 SAME = ("robot", "actuator", "effect", "contact", "rand", "termination")

@@ -44,30 +44,35 @@ class RunningAgent(Protocol):
         """Restore what ``save`` returned."""
 
 
-class Agent(Protocol):
-    """What moves robots in an evaluation, before there are any."""
+@dataclass(frozen=True)
+class Agent:
+    """What moves robots in an evaluation, before there are any.
 
-    @property
-    def label(self) -> str:
-        """Name in reports."""
+    Attributes:
+        label: name in reports.
+        task: the robot, rates and observations that it was made for.
+        about: plain data on its origin, for reports.
+        senses: whether it reads the robots' sensors itself, the IMU too, at a rate of its own.
+    """
 
-    @property
-    def task(self) -> TaskConfig:
-        """The robot, rates and observations that it was made for."""
-
-    @property
-    def about(self) -> dict[str, Any]:
-        """Plain data on its origin, for reports."""
-
-    @property
-    def senses(self) -> bool:
-        """Whether it reads the robots' sensors itself, the IMU too, at a rate of its own."""
+    label: str
+    task: TaskConfig
+    about: dict[str, Any] = field(default_factory=dict, kw_only=True)
+    senses: ClassVar[bool] = False
 
     def problems(self, trunk_velocity: TrunkVelocity, key: str) -> list[str]:
         """Return why it cannot be played so, each message beginning with the ``key`` of the setting."""
+        if trunk_velocity == "exact" or (name := self.unseen()) is None:
+            return []
+        return [f"{key} = 'estimated': the policy of {self.label} does not see {name}"]
+
+    def unseen(self) -> str | None:
+        """Return the name of the trunk's velocity if the agent observes velocities without it; else None."""
+        return None
 
     def begin(self, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> RunningAgent:
         """Take the robots of an environment, which is to be reset next."""
+        raise NotImplementedError
 
 
 TERM = "base_linear_velocity"
@@ -141,20 +146,14 @@ class EstimatedVelocity(VelocityFilters):
 
 
 @dataclass(frozen=True)
-class PolicyAgent:
+class PolicyAgent(Agent):
     """A trained policy: observations in, actions out."""
 
-    label: str
-    task: TaskConfig
     policy: Policy
-    about: dict[str, Any] = field(default_factory=dict)
-    senses: ClassVar[bool] = False
 
-    def problems(self, trunk_velocity: TrunkVelocity, key: str) -> list[str]:
-        """Return why the policy cannot be played so."""
-        if trunk_velocity == "estimated" and columns(self.task, TERM) is None:
-            return [f"{key} = 'estimated': the policy of {self.label} does not see {TERM}"]
-        return []
+    def unseen(self) -> str | None:
+        """Return the term of the trunk's velocity if the policy does not observe it."""
+        return TERM if columns(self.task, TERM) is None else None
 
     def begin(self, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> RunningAgent:
         """Take the robots of an environment."""
@@ -194,24 +193,18 @@ class _RunningPolicy:
 
 
 @dataclass(frozen=True)
-class BundleAgent:
+class BundleAgent(Agent):
     """The policy of a bundle as the robot's computer runs it: readings in, by ONNX.
 
     Its noise is that of the robot's sensors (the simulated robot's of ``go1exp deploy``), not that of training.
     """
 
-    label: str
-    task: TaskConfig
     bundle: Bundle
-    about: dict[str, Any] = field(default_factory=dict)
-    senses: ClassVar[bool] = False
 
-    def problems(self, trunk_velocity: TrunkVelocity, key: str) -> list[str]:
-        """Return why the bundle cannot be played so."""
-        names = [port.name for port in self.bundle.metadata.inputs]
-        if trunk_velocity == "estimated" and "base_lin_vel_b" not in names:
-            return [f"{key} = 'estimated': the policy of {self.label} does not see base_lin_vel_b"]
-        return []
+    def unseen(self) -> str | None:
+        """Return the name of the trunk's velocity if it is no input of the bundle."""
+        name = "base_lin_vel_b"
+        return None if any(port.name == name for port in self.bundle.metadata.inputs) else name
 
     def begin(self, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> RunningAgent:
         """Take the robots of an environment."""
@@ -247,18 +240,11 @@ class _RunningBundle:
 
 
 @dataclass(frozen=True)
-class ControllerAgent:
+class ControllerAgent(Agent):
     """Controllers of their own rate, one for each robot (``go1exp/evaluate/controller``)."""
 
-    label: str
-    task: TaskConfig
     make: Callable[[], Controller]
-    about: dict[str, Any] = field(default_factory=dict)
     senses: ClassVar[bool] = True
-
-    def problems(self, trunk_velocity: TrunkVelocity, key: str) -> list[str]:
-        """Return nothing: a controller takes either velocity."""
-        return []
 
     def begin(self, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> RunningAgent:
         """Take the robots of an environment."""

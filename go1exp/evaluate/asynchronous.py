@@ -46,14 +46,8 @@ def evaluated(run: Path, policy_file: Path, settings: dict[str, Any]) -> dict[st
     config, policy, _ = load_run(run, policy_file)
     commands = grid(settings["x"], settings["y"], settings["yaw"], False)
     names = ("episodes", "duration_s", "settle_s", "noise", "randomize", "seed")
-    wanted = EvalConfig(
-        commands=commands,
-        push=False,
-        train_ground=False,
-        policy_dt=None,
-        engine=CpuBackend(name="cpu", threads=1),
-        **{name: settings[name] for name in names},
-    )
+    engine = CpuBackend(name="cpu", threads=1)
+    wanted = EvalConfig(commands, engine=engine, **{name: settings[name] for name in names})
     rows = evaluate(config.task, policy, wanted)["rows"]
 
     def mean(name: str) -> float:
@@ -70,19 +64,8 @@ def record(run: Path, policy_file: Path, settings: dict[str, Any], out: Path) ->
     from go1exp.sim.env.core import Go1Core
 
     config, policy, _ = load_run(run, policy_file)
-    shown = EvalConfig(
-        commands=(tuple(settings["velocity"]),),
-        episodes=1,
-        duration_s=settings["seconds"],
-        settle_s=0.0,
-        policy_dt=None,
-        noise=False,
-        randomize=False,
-        push=False,
-        train_ground=False,
-        seed=1,
-        engine=CpuBackend(name="cpu", threads=1),
-    )
+    engine = CpuBackend(name="cpu", threads=1)
+    shown = EvalConfig((tuple(settings["velocity"]),), 1, settings["seconds"], engine=engine)
     core = Go1Core(evaluation_task(config.task, shown), 1, 1, noise=False)
     core.command.value[:] = core.command.value.new_tensor(settings["velocity"])
     out.parent.mkdir(exist_ok=True)

@@ -57,13 +57,13 @@ class EvalConfig:
     commands: tuple[Command, ...]
     episodes: int
     duration_s: float
-    settle_s: float
-    noise: bool
-    randomize: bool
-    push: bool
-    train_ground: bool
-    policy_dt: float | None
-    seed: int
+    settle_s: float = 0.0
+    noise: bool = False
+    randomize: bool = False
+    push: bool = False
+    train_ground: bool = False
+    policy_dt: float | None = None
+    seed: int = 1
     physics_dt: float | None = None
     trunk_velocity: TrunkVelocity = "exact"
     engine: BackendConfig | None = None
@@ -72,12 +72,6 @@ class EvalConfig:
     def random(self) -> bool:
         """Whether episodes of one command differ."""
         return self.noise or self.randomize or self.push or self.train_ground
-
-    @classmethod
-    def from_settings(cls, settings: Any, **changes: Any) -> EvalConfig:
-        """Build from those attributes that ``settings`` (of a verb) has; ``changes`` give the others."""
-        shared = {f.name: getattr(settings, f.name) for f in dataclasses.fields(cls) if hasattr(settings, f.name)}
-        return cls(**{**shared, **changes})
 
 
 def evaluation_task(task: TaskConfig, config: EvalConfig) -> TaskConfig:

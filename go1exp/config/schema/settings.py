@@ -30,13 +30,14 @@ def settings(kind: type[T]) -> type[T]:
     return pydantic_dataclass(kind, frozen=True, kw_only=True, config=STRICT)  # type: ignore[return-value]
 
 
-def parse(kind: type[T], container: Mapping[str, Any], examples: Mapping[str, str] | None = None) -> T:
+def parse(kind: type[T], container: Mapping[str, Any], examples: Mapping[str, str] | None = None, path: str = "") -> T:
     """Validate plain data as ``kind``.
 
     Args:
         kind: a class made by ``settings``, or another dataclass.
         container: a composed configuration, by key. Its ``plugins`` are loaded by ``config/schema/plugins.py``.
         examples: how a key that has no default is given, by key.
+        path: of the container, for messages.
 
     Raises:
         ConfigError: with every problem.
@@ -49,7 +50,7 @@ def parse(kind: type[T], container: Mapping[str, Any], examples: Mapping[str, st
     try:
         return TypeAdapter(kind).validate_json(as_json(container))
     except ValidationError as error:
-        raise ConfigError(explain(error, "", [f.name for f in fields(kind)])) from None  # type: ignore[arg-type]
+        raise ConfigError(explain(error, path, [f.name for f in fields(kind)])) from None  # type: ignore[arg-type]
 
 
 def subset(kind: type[T], given: Any, **others: Any) -> T:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field
 
-from go1exp.config.schema.registry import ConfigError, NonNegative, Positive, as_json, explain, unknown_name
-from go1exp.config.schema.settings import settings
+from go1exp.config.schema.registry import ConfigError, NonNegative, Positive, unknown_name
+from go1exp.config.schema.settings import parse, settings
 
 Share = Annotated[float, Field(gt=0, lt=1)]
 Phase = Annotated[float, Field(ge=0, lt=1)]
@@ -196,9 +195,5 @@ def parse_controller(given: Any) -> MpcSettings | PolicySettings:
     if not isinstance(given, Mapping) or given.get("name") not in CONTROLLERS:
         name = given.get("name") if isinstance(given, Mapping) else given
         raise ConfigError([unknown_name("controller.name", str(name), CONTROLLERS, "controller")])
-    kind = CONTROLLERS[given["name"]]
-    try:
-        checked: MpcSettings | PolicySettings = TypeAdapter(kind).validate_json(as_json(given))
-    except ValidationError as error:
-        raise ConfigError(explain(error, "controller", [f.name for f in fields(kind)])) from None
+    checked: MpcSettings | PolicySettings = parse(CONTROLLERS[given["name"]], given, path="controller")
     return checked

@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field
 
 from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import (
     ConfigError,
     Term,
-    as_json,
     bind_list,
-    explain,
     find,
     members,
     unknown_name,
     within,
 )
-from go1exp.config.schema.settings import settings
+from go1exp.config.schema.settings import parse, settings
 from go1exp.evaluate.controller.types import TrunkVelocity
 from go1exp.evaluate.protocol.claims import Claim
 from go1exp.evaluate.quantities import FINGERPRINT, LIFE, Column, Derived, Row
@@ -292,11 +290,7 @@ def _one(key: str, value: Any) -> Chosen:
     entry = find("protocol", name)
     if entry is None:
         raise ConfigError([unknown_name(path, name, [GRID, *members("protocol")], "protocol")])
-    kind: Any = entry.target
-    try:
-        protocol: Protocol = TypeAdapter(kind).validate_json(as_json(rest))
-    except ValidationError as error:
-        raise ConfigError(explain(error, path, [f.name for f in fields(kind)])) from None
+    protocol: Protocol = parse(cast(type, entry.target), rest, path=path)
     _check_claims(protocol, path)
     return Chosen(key, name, protocol)
 

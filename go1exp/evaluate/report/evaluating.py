@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from go1exp.config.schema.registry import TooLongError, bind_list
+from go1exp.config.schema.settings import subset
 from go1exp.evaluate.agents import PolicyAgent
 from go1exp.evaluate.protocol.base import Chosen
 from go1exp.evaluate.protocol.pages import write as write_protocol
@@ -63,7 +63,7 @@ def play_protocol(run: Run, protocol: Chosen, settings: EvaluationSettings, on_s
         ValueError: if the policy cannot play the protocol.
     """
     config, policy, about = load_run(run.folder, _checkpoint(run.folder, settings))
-    agent = PolicyAgent(run.label, config.task, policy, about)
+    agent = PolicyAgent(run.label, config.task, policy, about=about)
     velocities = protocol.protocol.policy_velocities().items()
     problems = [p for key, v in velocities for p in agent.problems(v, f"protocol.{protocol.key}.{key}")]
     if problems:
@@ -76,9 +76,7 @@ def evaluate_run(run: Path, settings: EvaluationSettings, on_step: Progress) -> 
     """Evaluate the policy of a run folder on the grid; return the report of ``evaluate``."""
     config, policy, about = load_run(run, _checkpoint(run, settings))
     commands = grid(settings.x, settings.y, settings.yaw, False)
-    unlike = ("commands", "train_ground", "policy_dt", "physics_dt", "trunk_velocity", "engine")
-    shared = {f.name: getattr(settings, f.name) for f in dataclasses.fields(EvalConfig) if f.name not in unlike}
-    wanted = EvalConfig(commands=commands, train_ground=False, policy_dt=None, **shared)
+    wanted = subset(EvalConfig, settings, commands=commands)
     measures = bind_list("measure", list(settings.measures), "evaluation.measures")
     return {"policy": about, "robot": {}, **evaluate(config.task, policy, wanted, on_step, measures), "criteria": []}
 

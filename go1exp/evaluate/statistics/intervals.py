@@ -10,6 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 LEVEL = 0.95
 
+POWER = 0.8
+"""Probability of detecting a difference, of sample sizes."""
+
 ROUNDING = 1e-9
 """Relative variation below which values are constant."""
 
@@ -36,7 +39,7 @@ def constant(values: ArrayLike, trim: float = 0.0) -> bool:
     return not len(middle) or bool(np.ptp(middle) <= ROUNDING * np.abs(each).max())
 
 
-def mean_interval(values: ArrayLike, level: float = LEVEL) -> Interval:
+def mean_interval(values: ArrayLike) -> Interval:
     """Return the mean of one value per robot with Student's t interval, NaN with fewer than two; NaNs are ignored."""
     from scipy import stats  # takes a moment to load
 
@@ -47,11 +50,11 @@ def mean_interval(values: ArrayLike, level: float = LEVEL) -> Interval:
     mean = float(each.mean())
     if len(each) < 2:
         return Interval(mean, np.nan, np.nan, 1)
-    half = float(stats.t.ppf(0.5 + 0.5 * level, len(each) - 1) * each.std(ddof=1) / np.sqrt(len(each)))
+    half = float(stats.t.ppf(0.5 + 0.5 * LEVEL, len(each) - 1) * each.std(ddof=1) / np.sqrt(len(each)))
     return Interval(mean, mean - half, mean + half, len(each))
 
 
-def phase_interval(phases: ArrayLike, level: float = LEVEL) -> Interval:
+def phase_interval(phases: ArrayLike) -> Interval:
     """Return the circular mean of one phase per robot, cycles in 0 to 1, and the interval of the deviations from it.
 
     The bounds may lie beyond 0 and 1, so that low <= mean <= high.
@@ -59,59 +62,51 @@ def phase_interval(phases: ArrayLike, level: float = LEVEL) -> Interval:
     each = np.asarray(phases, dtype=np.float64).ravel()
     each = each[np.isfinite(each)]
     mean = float(np.angle(np.exp(2j * np.pi * each).sum()) / (2.0 * np.pi) % 1.0) if len(each) else np.nan
-    around = mean_interval((each - mean + 0.5) % 1.0 - 0.5, level)
+    around = mean_interval((each - mean + 0.5) % 1.0 - 0.5)
     return Interval(mean, mean + around.low - around.estimate, mean + around.high - around.estimate, len(each))
 
 
-def share_interval(count: int, n: int, level: float = LEVEL) -> Interval:
+def share_interval(count: int, n: int) -> Interval:
     """Return the share ``count`` / ``n`` with Wilson's interval."""
     from scipy import stats
 
     if n < 1:
         return Interval(np.nan, np.nan, np.nan, 0)
-    bounds = stats.binomtest(count, n).proportion_ci(level, method="wilson")
+    bounds = stats.binomtest(count, n).proportion_ci(LEVEL, method="wilson")
     return Interval(count / n, float(bounds.low), float(bounds.high), n)
 
 
 # ---------------------------------------------------------------------- counts, medians, curves
 
 
-def rate_interval(count: int, exposure: float, level: float = LEVEL) -> Interval:
+def rate_interval(count: int, exposure: float) -> Interval:
     """Return ``count`` / ``exposure`` with the exact Poisson interval (Garwood 1936); n is the count."""
     from scipy import stats
 
     if not exposure > 0:
         return Interval(np.nan, np.nan, np.nan, count)
-    tail = 0.5 * (1.0 - level)
+    tail = 0.5 * (1.0 - LEVEL)
     low = stats.chi2.ppf(tail, 2 * count) / 2.0 if count else 0.0
     high = stats.chi2.ppf(1.0 - tail, 2 * count + 2) / 2.0
     return Interval(count / exposure, float(low / exposure), float(high / exposure), count)
 
 
-def bootstrap_interval(
-    function: Callable[[NDArray[np.intp]], float], n: int, draws: int = 400, level: float = LEVEL, seed: int = 0
-) -> Interval:
+def bootstrap_interval(function: Callable[[NDArray[np.intp]], float], n: int, draws: int = 400) -> Interval:
     """Return ``function`` of all of n robots, with its percentile interval over robots drawn with replacement.
 
     For quantities without an analytic interval, such as thresholds and areas. It is too narrow for few robots: for
     means of normal values it covers the truth in 79, 86 and 90 % of 4, 6 and 10 robots (docs/notebook/experiments.md).
-
-    Args:
-        function: a figure of the robots with these numbers (n,), each in 0 to n - 1; NaN where it is not defined.
-        n: robots.
-        draws: how many samples.
-        level: of the interval.
-        seed: of the draws.
+    ``function`` is of the robots with the numbers (n,), each in 0 to n - 1; NaN where it is not defined.
     """
     estimate = float(function(np.arange(n))) if n else np.nan
     if n < 2 or not np.isfinite(estimate):
         return Interval(estimate, np.nan, np.nan, n)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     each = np.array([function(rng.integers(n, size=n)) for _ in range(draws)])
     each = each[np.isfinite(each)]
     if len(each) < 0.5 * draws:  # mostly undefined
         return Interval(estimate, np.nan, np.nan, n)
-    low, high = np.quantile(each, [0.5 - 0.5 * level, 0.5 + 0.5 * level])
+    low, high = np.quantile(each, [0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL])
     return Interval(estimate, float(low), float(high), n)
 
 
@@ -161,18 +156,18 @@ def logistic_fit(x: ArrayLike, success: ArrayLike) -> Logistic | None:
 # ---------------------------------------------------------------------- pairs
 
 
-def paired_mean_interval(difference: ArrayLike, level: float = LEVEL) -> Interval:
+def paired_mean_interval(difference: ArrayLike) -> Interval:
     """Return the mean of one difference per robot with Student's t interval; NaNs are ignored.
 
     The bootstrap is too narrow for few robots. The interval is NaN where all differences are equal and not zero.
     """
-    around = mean_interval(difference, level)
+    around = mean_interval(difference)
     if around.n > 1 and around.estimate != 0.0 and constant(difference):
         return Interval(around.estimate, np.nan, np.nan, around.n)
     return around
 
 
-def paired_share_interval(first: ArrayLike, second: ArrayLike, level: float = LEVEL) -> Interval:
+def paired_share_interval(first: ArrayLike, second: ArrayLike) -> Interval:
     """Return the share of ``second`` minus that of ``first``, of the same robots, with Agresti and Min's interval.
 
     Half a robot is added to each of the four outcomes of a pair (Agresti and Min, Statistics in Medicine 24, 2005),
@@ -187,20 +182,15 @@ def paired_share_interval(first: ArrayLike, second: ArrayLike, level: float = LE
     gained, lost, all_of = (~a & b).sum() + 0.5, (a & ~b).sum() + 0.5, n + 2.0
     middle = (gained - lost) / all_of
     spread = np.sqrt((gained + lost - (gained - lost) ** 2 / all_of) / all_of**2)
-    half = float(stats.norm.ppf(0.5 + 0.5 * level) * spread)
+    half = float(stats.norm.ppf(0.5 + 0.5 * LEVEL) * spread)
     return Interval(float(b.mean() - a.mean()), max(middle - half, -1.0), min(middle + half, 1.0), n)
 
 
-def stratified_mean_interval(values: ArrayLike, strata: ArrayLike, level: float = LEVEL) -> Interval:
+def stratified_mean_interval(values: ArrayLike, strata: ArrayLike) -> Interval:
     """Return the mean of the strata's means with Student's interval from the variance within strata; NaNs are ignored.
 
     For one value per robot under fixed conditions, whose differences are no uncertainty. The variance is pooled over
-    the strata; the interval is NaN without variance.
-
-    Args:
-        values: (n,).
-        strata: (n,) stratum of each value.
-        level: of the interval.
+    the strata; the interval is NaN without variance. ``values`` and ``strata`` are (n,) each.
     """
     from scipy import stats
 
@@ -216,12 +206,12 @@ def stratified_mean_interval(values: ArrayLike, strata: ArrayLike, level: float 
     if not free or np.sqrt(within / free) <= ROUNDING * np.abs(each).max():
         return Interval(estimate, np.nan, np.nan, len(each))
     error = np.sqrt(within / free * (1.0 / sizes).sum()) / len(labels)
-    half = float(stats.t.ppf(0.5 + 0.5 * level, free) * error)
+    half = float(stats.t.ppf(0.5 + 0.5 * LEVEL, free) * error)
     return Interval(estimate, estimate - half, estimate + half, len(each))
 
 
-def pairs_needed(difference: ArrayLike, power: float = 0.8, level: float = LEVEL) -> int | None:
-    """Return the robots needed to detect the observed mean difference with this power; None if undefined.
+def pairs_needed(difference: ArrayLike) -> int | None:
+    """Return the robots needed to detect the observed mean difference with 80 % power; None if undefined.
 
     The normal approximation of a paired test: ((z_level + z_power) sd / mean)^2.
     """
@@ -231,5 +221,5 @@ def pairs_needed(difference: ArrayLike, power: float = 0.8, level: float = LEVEL
     each = each[np.isfinite(each)]
     if len(each) < 2 or each.mean() == 0.0 or constant(each):
         return None
-    z = float(stats.norm.ppf(0.5 + 0.5 * level) + stats.norm.ppf(power))
+    z = float(stats.norm.ppf(0.5 + 0.5 * LEVEL) + stats.norm.ppf(POWER))
     return max(2, int(np.ceil((z * each.std(ddof=1) / each.mean()) ** 2)))

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from go1exp.evaluate.statistics.intervals import LEVEL, Interval, constant, share_interval
+from go1exp.evaluate.statistics.intervals import LEVEL, POWER, Interval, constant, share_interval
 
 TRIM = 0.25
 """Share of the values that the interquartile mean omits at each end."""
@@ -38,7 +38,7 @@ def iqm(values: ArrayLike, axis: int | None = -1) -> Floats:
     return np.asarray(stats.trim_mean(np.asarray(values, dtype=np.float64), TRIM, axis=axis))
 
 
-def iqm_interval(values: ArrayLike, level: float = LEVEL) -> Interval:
+def iqm_interval(values: ArrayLike) -> Interval:
     """Return the interquartile mean of one value per run with its interval over runs; NaNs are ignored.
 
     The interval is NaN with fewer than two runs. See ``iqm_band``.
@@ -47,11 +47,11 @@ def iqm_interval(values: ArrayLike, level: float = LEVEL) -> Interval:
     each = each[np.isfinite(each)]
     if not len(each):
         return Interval(np.nan, np.nan, np.nan, 0)
-    middle, low, high = iqm_band(each[:, None], level)
+    middle, low, high = iqm_band(each[:, None])
     return Interval(float(middle[0]), float(low[0]), float(high[0]), len(each))
 
 
-def iqm_band(values: ArrayLike, level: float = LEVEL) -> tuple[Floats, Floats, Floats]:
+def iqm_band(values: ArrayLike) -> tuple[Floats, Floats, Floats]:
     """Return interquartile mean (T,), low and high (T,) at each of T times of n runs' values (n, T).
 
     The interval is studentised: the mean plus and minus a critical value times its standard error, the critical value
@@ -62,7 +62,7 @@ def iqm_band(values: ArrayLike, level: float = LEVEL) -> tuple[Floats, Floats, F
     middle = iqm(each, axis=0)
     if len(each) < 2:
         return middle, np.full_like(middle, np.nan), np.full_like(middle, np.nan)
-    half = _critical(len(each), level) * _standard_error(each.T)
+    half = _critical(len(each)) * _standard_error(each.T)
     return middle, middle - half, middle + half
 
 
@@ -78,29 +78,25 @@ def _standard_error(values: Floats) -> Floats:
 
 
 @cache
-def _critical(n: int, level: float) -> float:
-    """Return the ``level`` quantile of |error| / standard error of the interquartile mean of n normal values."""
+def _critical(n: int) -> float:
+    """Return the 95 % quantile of |error| / standard error of the interquartile mean of n normal values."""
     from scipy import stats
 
     if n > 40:
-        return float(stats.t.ppf(0.5 + 0.5 * level, n - 2 * int(TRIM * n) - 1))
+        return float(stats.t.ppf(0.5 + 0.5 * LEVEL, n - 2 * int(TRIM * n) - 1))
     sample = np.random.default_rng(n).normal(size=(SIMULATED, n))
-    return float(np.quantile(np.abs(iqm(sample)) / _standard_error(sample), level))
+    return float(np.quantile(np.abs(iqm(sample)) / _standard_error(sample), LEVEL))
 
 
 # ---------------------------------------------------------------------- falls
 
 
-def clustered_share(counts: ArrayLike, totals: ArrayLike, level: float = LEVEL) -> Interval:
+def clustered_share(counts: ArrayLike, totals: ArrayLike) -> Interval:
     """Return the share of falls with its interval over runs, within which falls are correlated.
 
     Wilson's interval with the effective number of robots (their number over the design effect, at least 1) and
     Student's quantile of the runs less one (Korn and Graubard 1998, with Wilson's interval). n is that of the runs.
-
-    Args:
-        counts: falls of each run (n,).
-        totals: robots of each run (n,).
-        level: of the interval.
+    ``counts`` are the falls of each run (n,), ``totals`` its robots (n,).
     """
     from scipy import stats
 
@@ -116,15 +112,13 @@ def clustered_share(counts: ArrayLike, totals: ArrayLike, level: float = LEVEL) 
     variance = n / (n - 1) * float((residuals**2).sum()) / everyone**2
     alone = share * (1.0 - share) / everyone
     effective = everyone / max(variance / alone, 1.0) if alone > 0.0 else everyone
-    z2 = float(stats.t.ppf(0.5 + 0.5 * level, n - 1)) ** 2
+    z2 = float(stats.t.ppf(0.5 + 0.5 * LEVEL, n - 1)) ** 2
     middle = (share + z2 / (2.0 * effective)) / (1.0 + z2 / effective)
     half = np.sqrt(z2 * (share * (1.0 - share) / effective + z2 / (4.0 * effective**2))) / (1.0 + z2 / effective)
     return Interval(share, max(float(middle - half), 0.0), min(float(middle + half), 1.0), n)
 
 
-def share_bootstrap(
-    counts: ArrayLike, totals: ArrayLike, draws: int = 2000, level: float = LEVEL, seed: int = 0
-) -> Interval:
+def share_bootstrap(counts: ArrayLike, totals: ArrayLike) -> Interval:
     """Return the share of falls with the percentile bootstrap interval over runs: too narrow for few runs."""
     fell, robots = np.asarray(counts, dtype=np.float64), np.asarray(totals, dtype=np.float64)
     fell, robots = fell[robots > 0], robots[robots > 0]
@@ -132,15 +126,15 @@ def share_bootstrap(
     if n < 2:
         share = float(fell.sum() / robots.sum()) if n else np.nan
         return Interval(share, np.nan, np.nan, n)
-    drawn = np.random.default_rng(seed).integers(n, size=(draws, n))
+    drawn = np.random.default_rng(0).integers(n, size=(2000, n))
     shares = fell[drawn].sum(1) / robots[drawn].sum(1)
-    low, high = np.quantile(shares, [0.5 - 0.5 * level, 0.5 + 0.5 * level])
+    low, high = np.quantile(shares, [0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL])
     return Interval(float(fell.sum() / robots.sum()), float(low), float(high), n)
 
 
-def pooled_share(counts: ArrayLike, totals: ArrayLike, level: float = LEVEL) -> Interval:
+def pooled_share(counts: ArrayLike, totals: ArrayLike) -> Interval:
     """Return the share of falls with Wilson's interval over all robots: of these policies alone."""
-    return share_interval(int(np.sum(counts)), int(np.sum(totals)), level)
+    return share_interval(int(np.sum(counts)), int(np.sum(totals)))
 
 
 Word = Literal["better", "worse", "no significant difference"]
@@ -177,14 +171,13 @@ class Difference:
     least_p: float
 
 
-def difference(group: ArrayLike, baseline: ArrayLike, paired: bool = False, seed: int = 0) -> Difference:
+def difference(group: ArrayLike, baseline: ArrayLike, paired: bool = False) -> Difference:
     """Return the difference of the runs (n,) of a group from those (m,) of the baseline; NaNs are ignored.
 
     Args:
         group: one value per run.
         baseline: one value per run, in the same order if ``paired``.
         paired: whether the k-th runs of both are pairs.
-        seed: of random permutations.
     """
     a, b = np.asarray(group, dtype=np.float64), np.asarray(baseline, dtype=np.float64)
     if paired:
@@ -194,14 +187,14 @@ def difference(group: ArrayLike, baseline: ArrayLike, paired: bool = False, seed
         a, b = a[np.isfinite(a)], b[np.isfinite(b)]
     return Difference(
         estimate=yuen(a, b, paired),
-        p=permutation_p(a, b, paired, seed),
+        p=permutation_p(a, b, paired),
         effect=hedges(a, b),
         improvement=probability_of_improvement(a, b),
         least_p=least_p(len(a), len(b), paired),
     )
 
 
-def permutation_p(a: NDArray[np.float64], b: NDArray[np.float64], paired: bool = False, seed: int = 0) -> float:
+def permutation_p(a: NDArray[np.float64], b: NDArray[np.float64], paired: bool = False) -> float:
     """Return the two-sided p of the difference of runs (n,) and (m,); NaN with fewer than two runs in a group.
 
     A permutation test of mean ranks (Wilcoxon 1945) over all, or 20,000, permutations of the runs, or within pairs. It
@@ -214,15 +207,15 @@ def permutation_p(a: NDArray[np.float64], b: NDArray[np.float64], paired: bool =
     if paired:
         gain = a - b
         signed = stats.rankdata(np.abs(gain)) * np.sign(gain)
-        return _p_of_ranks((tuple(np.sort(signed).tolist()),), seed) if gain.any() else 1.0
+        return _p_of_ranks((tuple(np.sort(signed).tolist()),)) if gain.any() else 1.0
     together = stats.rankdata(np.concatenate([a, b]))
     if constant(np.concatenate([a, b])):
         return 1.0
-    return _p_of_ranks(tuple(tuple(np.sort(each).tolist()) for each in np.split(together, [len(a)])), seed)
+    return _p_of_ranks(tuple(tuple(np.sort(each).tolist()) for each in np.split(together, [len(a)])))
 
 
 @lru_cache(maxsize=4096)
-def _p_of_ranks(ranks: tuple[tuple[float, ...], ...], seed: int) -> float:
+def _p_of_ranks(ranks: tuple[tuple[float, ...], ...]) -> float:
     """Return the p of one sample of signed ranks, or of two samples of ranks; cached, since ranks recur."""
     from scipy import stats
 
@@ -234,7 +227,7 @@ def _p_of_ranks(ranks: tuple[tuple[float, ...], ...], seed: int) -> float:
         vectorized=True,
         n_resamples=RESAMPLES,
         axis=-1,
-        rng=seed,
+        rng=0,
     )
     return float(done.pvalue)
 
@@ -278,7 +271,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return [float(value) for value in adjusted]
 
 
-def yuen(a: NDArray[np.float64], b: NDArray[np.float64], paired: bool = False, level: float = LEVEL) -> Interval:
+def yuen(a: NDArray[np.float64], b: NDArray[np.float64], paired: bool = False) -> Interval:
     """Return the difference of interquartile means with Yuen's interval (1974); of pairs, that of their differences.
 
     The interval is NaN where both groups, or the differences of pairs, are constant and the estimate is not zero.
@@ -297,9 +290,9 @@ def yuen(a: NDArray[np.float64], b: NDArray[np.float64], paired: bool = False, l
         bound = 0.0 if estimate == 0.0 else math.nan
         return Interval(estimate, bound, bound, n)
     if paired:
-        return iqm_interval(parts[0], level)
+        return iqm_interval(parts[0])
     centred = (part - np.median(part) for part in parts)  # exact for a constant group; only the width is used
-    bounds = stats.ttest_ind(*centred, equal_var=False, trim=trim).confidence_interval(level)
+    bounds = stats.ttest_ind(*centred, equal_var=False, trim=trim).confidence_interval(LEVEL)
     shift = estimate - 0.5 * (bounds.low + bounds.high)
     return Interval(estimate, float(bounds.low + shift), float(bounds.high + shift), n)
 
@@ -325,8 +318,8 @@ def probability_of_improvement(a: ArrayLike, b: ArrayLike) -> float:
     return float((above + 0.5 * equal).mean())
 
 
-def runs_needed(a: NDArray[np.float64], b: NDArray[np.float64], power: float = 0.8, alpha: float = ALPHA) -> int | None:
-    """Return the runs per group needed to detect the observed difference with this power; None if undefined.
+def runs_needed(a: NDArray[np.float64], b: NDArray[np.float64], alpha: float = ALPHA) -> int | None:
+    """Return the runs per group needed to detect the observed difference with 80 % power; None if undefined.
 
     The normal approximation for two groups, with a quarter of the squared quantile for Student's: n = (z_alpha +
     z_power)^2 (s_a^2 + s_b^2) / d^2 + z_alpha^2 / 4.
@@ -335,16 +328,16 @@ def runs_needed(a: NDArray[np.float64], b: NDArray[np.float64], power: float = 0
 
     if min(len(a), len(b)) < 2 or a.mean() == b.mean():
         return None
-    z_alpha, z_power = float(stats.norm.ppf(1.0 - 0.5 * alpha)), float(stats.norm.ppf(power))
+    z_alpha, z_power = float(stats.norm.ppf(1.0 - 0.5 * alpha)), float(stats.norm.ppf(POWER))
     ratio = (a.var(ddof=1) + b.var(ddof=1)) / (a.mean() - b.mean()) ** 2
     needed = (z_alpha + z_power) ** 2 * ratio + 0.25 * z_alpha**2
     least = runs_for_significance(alpha=alpha)
     return max(least, math.ceil(needed)) if least is not None and needed < 1e6 else None
 
 
-def verdict_by_p(estimate: float, p: float, better: Direction, alpha: float = ALPHA) -> Word:
+def verdict_by_p(estimate: float, p: float, better: Direction) -> Word:
     """Return the verdict on a difference, group - baseline, by its adjusted p."""
-    if not (math.isfinite(p) and p <= alpha) or estimate == 0.0:
+    if not (math.isfinite(p) and p <= ALPHA) or estimate == 0.0:
         return "no significant difference"
     return "better" if (estimate > 0.0) == (better == "higher") else "worse"
 
