@@ -229,6 +229,19 @@ def rounded(values: ArrayLike) -> list[Any]:
     return list(plain.tolist())
 
 
+def bands(values: NDArray[np.float64], middle: Callable[..., Any]) -> NDArray[np.float64]:
+    """Return the ``middle`` and the 10th and 90th percentile over robots of values (T, N, ...), (3, T, ...).
+
+    NaNs are ignored; the result is NaN at times without any other value.
+    """
+    known = np.isfinite(values).reshape(len(values), -1).any(1)
+    over = np.full((3, len(values), *values.shape[2:]), np.nan)
+    if known.any():
+        over[0, known] = middle(values[known], axis=1)
+        over[1:, known] = np.nanpercentile(values[known], (10.0, 90.0), axis=1)
+    return over
+
+
 def lives(motion: Motion) -> list[Row]:
     """Return one row for each robot: falls, time under a command, fingerprint."""
     lives_of_robots = zip(motion.fell, motion.left_map, motion.moving_s, motion.fingerprint, strict=True)

@@ -13,7 +13,7 @@ from go1exp.base.report import plots
 from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Played, rounded
+from go1exp.evaluate.protocol.base import Played, bands, rounded
 from go1exp.evaluate.protocol.kinds.steady import ERRORS, Steady, by_axis, command_text
 from go1exp.evaluate.quantities import Column, Row
 
@@ -57,10 +57,7 @@ class Corners(Steady):
             if not c.any():
                 continue
             along = np.where(motion.alive[:, robots], motion.velocity[:, robots] @ c / (c @ c), np.nan)
-            up_steps = np.isfinite(along).any(1)
-            mean = np.full(len(along), np.nan)
-            mean[up_steps] = np.nanmean(along[up_steps], axis=1)
-            shares[command_text(by_axis(command))] = rounded(mean)
+            shares[command_text(by_axis(command))] = rounded(bands(along, np.nanmean)[0])
         return {"t": rounded(motion.t), "along": shares}
 
     def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:

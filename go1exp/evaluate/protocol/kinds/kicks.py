@@ -14,7 +14,18 @@ from go1exp.base.report import plots
 from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import NonNegative, Positive, protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Cause, Impulse, Length, Played, Point, Protocol, lives, repeated, rounded
+from go1exp.evaluate.protocol.base import (
+    Cause,
+    Impulse,
+    Length,
+    Played,
+    Point,
+    Protocol,
+    bands,
+    lives,
+    repeated,
+    rounded,
+)
 from go1exp.evaluate.protocol.signals import Signal
 from go1exp.evaluate.quantities import Column, Row
 
@@ -211,12 +222,7 @@ class Kicks(Protocol):
         curves = {"impulse": float(self.impulses[k]), "t": rounded(steps * dt), "n": int(keep.sum())}
         for name, values in (("height", motion.height), ("speed", along)):
             each = np.where(alive, values[rows, robots][:, keep], np.nan)
-            up_steps = np.isfinite(each).any(1)
-            bands = np.full((3, len(steps)), np.nan)
-            if up_steps.any():
-                bands[0, up_steps] = np.nanmedian(each[up_steps], axis=1)
-                bands[1:, up_steps] = np.nanpercentile(each[up_steps], (10.0, 90.0), axis=1)
-            curves[name] = rounded(bands)
+            curves[name] = rounded(bands(each, np.nanmedian))
         return curves
 
     def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:

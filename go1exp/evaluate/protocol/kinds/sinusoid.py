@@ -13,7 +13,7 @@ from go1exp.base.report import plots
 from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import Positive, protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, lives, repeated, rounded
+from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, bands, lives, repeated, rounded
 from go1exp.evaluate.protocol.signals import Sine, response
 from go1exp.evaluate.quantities import Column, Row
 
@@ -135,12 +135,8 @@ def _curve(motion: Motion, robots: slice) -> dict[str, Any]:
     """Return the velocities of some robots for a drawing; of robots while they are up."""
     up = motion.alive[::EVERY, robots, None]
     velocity = np.where(up, motion.velocity[::EVERY, robots], np.nan)
-    any_up = up.any((1, 2))
-    bands = np.full((3, len(velocity), 3), np.nan)
-    bands[0, any_up] = np.nanmean(velocity[any_up], axis=1)
-    bands[1:, any_up] = np.nanpercentile(velocity[any_up], (10.0, 90.0), axis=1)
-    one = velocity[:, 0]
-    named = {"mean": bands[0], "low": bands[1], "high": bands[2], "one": one}
+    mean, low, high = bands(velocity, np.nanmean)
+    named = {"mean": mean, "low": low, "high": high, "one": velocity[:, 0]}
     named["command"] = motion.command[::EVERY, robots.start]
     return {"t": rounded(motion.t[::EVERY]), **{name: rounded(values) for name, values in named.items()}}
 
