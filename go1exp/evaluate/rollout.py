@@ -327,15 +327,9 @@ def delay_margin(
     on_step: Callable[[int, int], None] = lambda done, total: None,
     controller: Callable[[], Controller] | None = None,
 ) -> dict[str, Any]:
-    """Run the grid with growing command delay until a robot falls.
+    """Run the grid of ``evaluate`` with growing command delay until a robot falls.
 
-    Args:
-        task: as for ``evaluate``; a delay of its actuator stays, and the margin is added to it.
-        policy: as for ``evaluate``.
-        config: as for ``evaluate``.
-        falls: ``distinct_falls`` of the grid without any further delay.
-        on_step: called with the progress of each run.
-        controller: as for ``evaluate``.
+    A delay of the actuator stays, and the margin is added to it. ``falls`` are the ``distinct_falls`` without any.
 
     Returns:
         ``ms``, the largest delay without falls, None if robots fall without any; ``falls`` of each delay that was run.

@@ -26,12 +26,7 @@ GRID = [[x, 0.0, 0.0] for x in (0.0, -1.0, -0.5, 0.5, 1.0, 1.5)] + [[0.0, 0.5, 0
 
 
 def run(container: dict[str, Any], on_round: Callable[[int, int], None]) -> dict[str, float]:
-    """Report a synthetic study in a separate process; return its time, memory and page size.
-
-    Args:
-        container: training configuration of which the runs are variations.
-        on_round: called with the progress.
-    """
+    """Report a synthetic study in a separate process; return its time, memory and page size."""
     with tempfile.TemporaryDirectory() as folder:
         study = Path(folder)
         for number in range(RUNS):

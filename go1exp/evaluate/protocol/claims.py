@@ -44,11 +44,8 @@ class Verdict:
     """A claim and its worst condition.
 
     Attributes:
-        name: of the claim.
         word: met, close, not met or inconclusive.
-        claim: the claim.
         figure: figure of the worst condition with its 95 % interval.
-        condition: the worst condition.
         conditions: number of conditions with the figure.
     """
 

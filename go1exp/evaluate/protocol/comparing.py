@@ -30,10 +30,6 @@ class Difference:
     """Difference of one figure between a subject and the first one.
 
     Attributes:
-        subject: label of the subject.
-        quantity: the figure.
-        unit: its unit.
-        condition: condition of the figure.
         first: figure of the first subject over the pairs.
         other: figure of the other subject.
         difference: other - first with its interval; n is the number of pairs.

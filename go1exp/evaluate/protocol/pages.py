@@ -258,13 +258,7 @@ def write(result: Result, folder: Path) -> list[Path]:
 def comparison(
     plays: Mapping[str, Sequence[Result]], differences: Mapping[str, Sequence[Difference]], about: Mapping[str, Any]
 ) -> str:
-    """Return the page of a comparison.
-
-    Args:
-        plays: results of all subjects, by protocol.
-        differences: of the other subjects to the first, by protocol.
-        about: settings and provenance, plain data.
-    """
+    """Return the page of a comparison."""
     tables, drawings = [_counts(differences)], []
     for key, results in plays.items():
         tables.append(_differences(key, differences[key], results[0].label, meanings(results[0])))

@@ -25,14 +25,12 @@ class Curve:
     """One metric of one group over one axis.
 
     Attributes:
-        group: its name.
         metric: column of metrics.csv.
         axis: steps or hours.
         x: (T,), million steps or hours.
         middle: interquartile mean over runs (T,).
         low: lower bound of its 95 % interval (T,), NaN of one run.
         high: upper bound (T,).
-        runs: number of runs.
         last: the last value of each run (runs,).
     """
 

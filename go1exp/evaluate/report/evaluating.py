@@ -86,10 +86,7 @@ def evaluate_missing(
 ) -> list[str]:
     """Evaluate runs one after the other and write the results into their folders; return remarks.
 
-    Args:
-        wanted: evaluations to make.
-        settings: of the evaluations on the grid.
-        on_run: called with the number of the evaluation, the number of all and its label; returns a progress callback.
+    ``on_run`` gets the number of the evaluation, the number of all and its label, and returns a progress callback.
 
     Raises:
         TooLongError: if the evaluations do not fit into memory.

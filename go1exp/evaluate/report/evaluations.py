@@ -58,10 +58,8 @@ class Evaluation:
     Attributes:
         name: grid, or the protocol's.
         keys: columns with the condition of a row.
-        columns: quantities.
         main: names of the compared quantities.
         runs: rows by run folder.
-        settings: of the evaluation.
     """
 
     name: str
@@ -97,11 +95,6 @@ def evaluations(study: Study) -> list[Evaluation]:
 
 def check_figures(wanted: Sequence[str], known: Sequence[Evaluation], to_come: Sequence[Chosen | None] = ()) -> None:
     """Refuse quantities that no evaluation has, and those without a better direction.
-
-    Args:
-        wanted: names.
-        known: evaluations that runs have.
-        to_come: protocols that will be played, None for the grid.
 
     Raises:
         ConfigError: naming each, with the nearest known names.

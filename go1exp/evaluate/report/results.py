@@ -45,8 +45,6 @@ class Figure:
     """One quantity of one group.
 
     Attributes:
-        group: name of the group.
-        column: the quantity.
         runs: estimate with its interval over runs; n is the number of runs.
         robots: of a share, Wilson's interval over all robots of these runs; else None.
         bootstrap: of a share, the percentile interval over runs; else None.
@@ -68,8 +66,6 @@ class Verdict:
     """One quantity of one group compared with the baseline.
 
     Attributes:
-        group: name of the group.
-        column: the quantity.
         first: interquartile mean of the baseline.
         other: interquartile mean of the group.
         difference: with its p and effect sizes.
@@ -98,8 +94,6 @@ class Sensitivity:
 
     Attributes:
         source: a swept setting (over runs), or a randomised quantity (over robots).
-        column: the result.
-        association: correlation and importance.
         adjusted_p: after Holm's correction over the quantities of the same source and result.
     """
 
@@ -173,13 +167,8 @@ def compared(
 ) -> list[Verdict]:
     """Compare each evaluated group with the baseline, quantity by quantity.
 
-    Args:
-        evaluation: of all runs.
-        made: all groups.
-        baseline: one of the groups.
-        wanted: names of quantities, as far as the evaluation has them; None takes its main ones.
-        correction: over all quantities of all groups, or none.
-        paired: pair runs by their seed.
+    ``wanted`` names quantities, as far as the evaluation has them; None takes its main ones. The correction is over all
+    quantities of all groups. ``paired`` pairs runs by their seed.
     """
     known = {c.name: c for c in evaluation.columns if c.better}
     columns = [known[name] for name in (wanted or evaluation.main) if name in known]
@@ -322,12 +311,8 @@ class Outcome:
     """Results of one evaluation of all runs.
 
     Attributes:
-        evaluation: of all runs.
-        figures: quantities over all conditions.
-        by_condition: quantities of each condition.
         verdicts: comparisons with the baseline; none for a single group.
         runs_required: least number of runs per group with which a difference can be significant; None for none.
-        sensitivities: correlates of the main quantities.
     """
 
     evaluation: Evaluation
@@ -340,16 +325,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Report:
-    """Content of a report.
-
-    Attributes:
-        study: included and excluded runs.
-        groups: of the included runs.
-        baseline: one of the groups.
-        curves: of metrics.
-        outcomes: of evaluations.
-        settings: as requested, plain data.
-    """
+    """Content of a report."""
 
     study: Study
     groups: list[Group]

@@ -41,10 +41,7 @@ class Run:
     """One training run.
 
     Attributes:
-        folder: its run folder.
         label: unique name in reports.
-        config: resolved configuration.
-        seed: of the training.
         state: done, running, stopped, failed, or not started.
         cause: reason of a failure.
         job: name in the sweep; empty without one.
@@ -70,13 +67,7 @@ class Absent:
 
 @dataclass
 class Study:
-    """Contents of folders.
-
-    Attributes:
-        runs: included runs.
-        absent: excluded ones.
-        notes: remarks for the reader, one line each.
-    """
+    """Contents of folders."""
 
     runs: list[Run]
     absent: list[Absent] = field(default_factory=list)
@@ -88,9 +79,7 @@ class Group:
     """Runs that differ in their seed alone.
 
     Attributes:
-        name: unique name.
         settings: keys in which groups differ, with this group's values; "-" for a missing key.
-        runs: by seed.
     """
 
     name: str
@@ -110,11 +99,7 @@ class _Job:
 
 
 def study(folders: Sequence[str], unfinished: bool) -> Study:
-    """Return the runs below ``folders``, each once.
-
-    Args:
-        folders: run folders, sweeps, or folders above them.
-        unfinished: include runs that are not done, too.
+    """Return the runs below ``folders``, each once; ``unfinished`` includes those that are not done.
 
     Raises:
         ConfigError: if a folder is missing or holds no run, or if none of them has begun.

@@ -28,11 +28,9 @@ class Association:
     """Correlation of one quantity with another.
 
     Attributes:
-        name: of the quantity.
         spearman: rank correlation; NaN for categories.
         p: of the correlation, two-sided, or of the variance between categories; by permutation.
         importance: explained share of the variance; 0 or less is none.
-        n: number of values.
     """
 
     name: str

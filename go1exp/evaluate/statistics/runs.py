@@ -174,10 +174,7 @@ class Difference:
 def difference(group: ArrayLike, baseline: ArrayLike, paired: bool = False) -> Difference:
     """Return the difference of the runs (n,) of a group from those (m,) of the baseline; NaNs are ignored.
 
-    Args:
-        group: one value per run.
-        baseline: one value per run, in the same order if ``paired``.
-        paired: whether the k-th runs of both are pairs.
+    ``paired`` pairs the k-th runs of both.
     """
     a, b = np.asarray(group, dtype=np.float64), np.asarray(baseline, dtype=np.float64)
     if paired:

@@ -121,10 +121,6 @@ def launch(target: Callable[[endpoints.ViewerEndpoint], None], plugins: list[Any
 
     The process is a fork: it has what this one has loaded, and starts at once.
 
-    Args:
-        target: makes the viewer on its endpoint and runs it.
-        plugins: of this side.
-
     Returns:
         The handle of this side; its use raises ``Expected`` when the page ended by an error.
     """

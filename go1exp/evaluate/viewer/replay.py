@@ -96,8 +96,6 @@ class Story:
 
     Attributes:
         kind: of a log, or of a result of ``go1exp gap``.
-        about: a description.
-        pieces: in order.
     """
 
     kind: Literal["log", "gap"]
@@ -141,10 +139,7 @@ class Player:
     """Position in a story.
 
     Attributes:
-        story: the replay.
-        number: index of the piece.
         time: s from its beginning.
-        running: whether time passes.
         speed: s of the recording per s.
         magnify: factor by which errors are magnified.
     """
@@ -288,8 +283,6 @@ class Ghost:
     """A robot drawn in addition to the model's own.
 
     Attributes:
-        name: of its motion.
-        qpos: generalised coordinates.
         shift: (3,) displacement, m.
     """
 
@@ -303,9 +296,7 @@ class ReplayView:
     """Content of the panels beside the story, which they have themselves: it is long, and this is sent often.
 
     Attributes:
-        number: index of the piece.
         time: s from its beginning.
-        running: whether time passes.
         speed: s of the recording per s.
         magnify: factor by which errors are magnified.
         ghosts: robots drawn in addition to the model's own, which is the first motion shown.
@@ -320,13 +311,7 @@ class ReplayView:
 
 
 class ReplayShow:
-    """A story in its scene.
-
-    Attributes:
-        player: the position in it.
-        model: the scene with one robot.
-        data: its state.
-    """
+    """A story in its scene."""
 
     def __init__(self, story: Story, config: RobotConfig, model: mujoco.MjModel | None = None) -> None:
         """Build the scene: with the Go1, or with the model of another robot, on its base.

@@ -69,7 +69,6 @@ class SelectGround:
     """Restart on another ground.
 
     Attributes:
-        ground: its name.
         level: difficulty: the row of graded tiles, or a lane's difficulty in its own unit.
         tile: kind of tile, of graded tiles.
     """
@@ -101,7 +100,6 @@ class Pace:
     """Set the speed of the simulation.
 
     Attributes:
-        paused: whether the simulation is paused.
         speed: simulated seconds per second.
     """
 
@@ -134,10 +132,7 @@ def catalogue(effects: tuple[Term, ...], randomize: bool) -> tuple[dict[str, Ter
     """Return every effect by name at size 1, and the sizes of those that the robot has.
 
     An effect of the robot with nominal values of null (only randomised in training) is inactive, as its choice has it.
-
-    Args:
-        effects: of the robot.
-        randomize: keep the randomisation of its own effects.
+    ``randomize`` keeps the randomisation of the robot's own effects.
     """
     known: dict[str, Term] = {}
     for file in choice_files("effect", [config_folder()]).values():
@@ -161,13 +156,7 @@ def _is_active(term: Term) -> bool:
 def active(
     sizes: Mapping[str, float], effects: Mapping[str, Term], actuator: Term, contact: ContactConfig
 ) -> tuple[Term, ...]:
-    """Return the effects of a size above 0, at that size.
-
-    Args:
-        sizes: by name.
-        effects: by name, at size 1.
-        actuator: its term.
-        contact: of the feet.
+    """Return the effects of a size above 0, at that size; ``effects`` has all by name, at size 1.
 
     Raises:
         ConfigError: if a name is unknown, or effects and actuator are incompatible.
@@ -248,8 +237,6 @@ class Ground:
 
     Attributes:
         config: graded tiles or a plane; None for a lane.
-        lane: its name; None for the others.
-        hardest: largest level.
         unit: of a level; empty for rows of tiles.
         tiles: kinds of tile.
     """
@@ -285,18 +272,7 @@ def grounds(files: Mapping[str, TerrainConfig]) -> dict[str, Ground]:
 
 @dataclass(frozen=True)
 class Setup(Conditions):
-    """Conditions of a simulation.
-
-    Attributes:
-        ground: its name.
-        level: as in ``SelectGround``.
-        tile: as in ``SelectGround``.
-        sizes: of the active effects, by name.
-        randomize: randomise robots and starts as in training.
-        push: push as in training.
-        engine: physics engine; None for MuJoCo on the CPU.
-        seed: of everything random.
-    """
+    """Conditions of a simulation; ``level`` and ``tile`` as in ``SelectGround``."""
 
     ground: str = FLAT
     level: float = 0.0
@@ -310,12 +286,6 @@ class Setup(Conditions):
 
 def task_under(task: TaskConfig, setup: Setup, known: Mapping[str, Ground], effects: Mapping[str, Term]) -> TaskConfig:
     """Return the task of a policy under ``setup``; the physics step is rounded down to fit the policy's period.
-
-    Args:
-        task: of the policy.
-        setup: the conditions.
-        known: grounds by name.
-        effects: by name, at size 1.
 
     Raises:
         ConfigError: if effects and actuator are incompatible, or a name is not known.

@@ -99,8 +99,6 @@ class Robots:
 
     Attributes:
         agents: label -> loader of the policy, bundle or controller.
-        grounds: by name.
-        effects: by name, at size 1.
     """
 
     agents: Mapping[str, Callable[[], Agent]]
@@ -130,17 +128,10 @@ class Session:
 
     Attributes:
         robots: what can be selected.
-        core: the environment.
-        setup: the conditions.
         label: of the present policy.
-        command: the commanded velocity.
-        rewards: names of the reward terms.
-        paused: whether the simulation is paused.
         speed: simulated seconds per second.
         time: simulated seconds since the session began.
-        falls: number of falls.
         message: for the user, a line; empty for none.
-        push: the last one.
     """
 
     def __init__(self, robots: Robots, label: str, setup: Setup, velocity: requests.Velocity) -> None:

@@ -70,13 +70,8 @@ class Frame:
             one; time between new commands, s, NaN for a packet that repeats the one before.
         peer: address of the client; None before the first packet.
         connected: whether a packet of the client has arrived in the last second.
-        states: sent so far.
-        lost: datagrams that the simulated network has lost.
-        refused: number of rejected datagrams by reason.
         slipped: time by which the robot's clock is behind real time, s.
-        posture: what the robot does.
         push: the last one, by the robot's clock.
-        message: for the user.
         sizes: of the active effects, by name.
     """
 
@@ -352,11 +347,7 @@ def _run(
 
 
 class Answering:
-    """Answers the page between two ticks; never waits.
-
-    Attributes:
-        going: whether the page is still there.
-    """
+    """Answers the page between two ticks; never waits."""
 
     def __init__(self, probe: Probe, pipe: Connection) -> None:
         self.going, self._probe, self._pipe = True, probe, pipe

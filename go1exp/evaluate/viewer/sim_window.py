@@ -96,12 +96,7 @@ class SimView(Timed):
 
 
 class SimShow:
-    """Scene and curves of a robot that an external client commands.
-
-    Attributes:
-        model: the scene.
-        data: its state.
-    """
+    """Scene and curves of a robot that an external client commands."""
 
     def __init__(self, link: Link, body: Body) -> None:
         self._link, self._body = link, body

@@ -43,13 +43,7 @@ Series = list[list[float]]
 
 @dataclass(frozen=True)
 class Arrow:
-    """An arrow in the scene.
-
-    Attributes:
-        start: (3,) m.
-        end: (3,) m.
-        rgb: its colour.
-    """
+    """An arrow in the scene from ``start`` to ``end``, (3,) m."""
 
     start: Vector
     end: Vector
@@ -66,7 +60,6 @@ class Timed:
         torque: twelve, over the limit.
         contacts: contact intervals of each leg, s.
         pushes: times of pushes, s.
-        arrows: in the scene.
     """
 
     t: list[float]
@@ -97,23 +90,9 @@ class WalkView(Timed):
     """Content of the panels.
 
     Attributes:
-        label: of the present policy.
-        labels: of all policies.
-        setup: the conditions.
-        grounds: selectable ones.
-        effects: selectable ones, each with its description.
-        command: the commanded velocity.
-        limits: of each of its axes.
-        pace: requested speed.
         achieved: simulated seconds per second.
         time: simulated s.
-        falls: so far.
-        message: for the user.
         physics_dt: step in force, s.
-        command_curves: three.
-        true: three.
-        estimated: three, or none.
-        rewards: all.
         total: of all rewards, per second.
     """
 
