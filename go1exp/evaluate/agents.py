@@ -124,14 +124,9 @@ class VelocityFilters:
 
 
 class EstimatedVelocity(VelocityFilters):
-    """The filters of a policy that observes the trunk's velocity."""
+    """The filters of a policy that observes the trunk's velocity; raises ConfigError for one that does not."""
 
     def __init__(self, core: Go1Core, noise: bool, seed: int) -> None:
-        """Observe the plant of ``core``; arguments as those of ``VelocityFilters``.
-
-        Raises:
-            ConfigError: if the policy does not observe the velocity.
-        """
         velocity_columns = columns(core.task, TERM)
         if velocity_columns is None:
             raise ConfigError([f"trunk_velocity = 'estimated': the policy does not see {TERM}"])

@@ -15,7 +15,6 @@ from go1exp.base.errors import Expected
 from go1exp.base.wording import counted
 from go1exp.mdp.derived import slip_speed
 from go1exp.mdp.measures.trace import Trace
-from go1exp.mdp.types import Snapshot
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TaskConfig
 
@@ -91,7 +90,8 @@ class Recorder:
         for name in SNAPSHOT_COLUMNS:
             columns[name][row] = getattr(s, name).numpy()
         columns["foot_slip_speed"][row] = slip_speed(s).numpy()
-        columns["base_height"][row] = self._height(s)
+        assert s.base_pos_w is not None
+        columns["base_height"][row] = (s.base_pos_w[:, 2] - self._core.ground_height(s.base_pos_w[:, :2])).numpy()
         self._counts[row] = alive.numpy()
         self._row += 1
 
@@ -136,11 +136,6 @@ class Recorder:
         power = self._plant.torque.numpy() * self._plant.qd.numpy()
         columns["positive_power"][row] += np.maximum(power, 0.0).sum(-1)
         self._touching, self._sample = touching, self._sample + 1
-
-    def _height(self, s: Snapshot) -> NDArray[np.float32]:
-        assert s.base_pos_w is not None
-        height: NDArray[np.float32] = (s.base_pos_w[:, 2] - self._core.ground_height(s.base_pos_w[:, :2])).numpy()
-        return height
 
 
 def _masses(core: Go1Core) -> NDArray[np.float64]:

@@ -62,7 +62,7 @@ def record(
     seconds: float,
     env: int = 0,
     fps: float = 25,
-    on_frame: Callable[[int, int], None] | None = None,
+    on_frame: Callable[[int, int], None] = lambda done, total: None,
     *,
     caption: bool = True,
     footfalls: bool = False,
@@ -89,48 +89,38 @@ def record(
     """
     camera = Camera(core, width, height)  # here, not in the generator, so that errors are raised before it starts
     diagram = Footfalls(core.task.sim.policy_dt) if footfalls else None
-    return _frames(camera, policy, seconds, env, fps, on_frame or (lambda done, total: None), caption, diagram)
 
-
-def _frames(
-    camera: Camera,
-    policy: Policy,
-    seconds: float,
-    env: int,
-    fps: float,
-    on_frame: Callable[[int, int], None],
-    caption: bool,
-    diagram: Footfalls | None,
-) -> Iterator[Picture]:
-    core = camera.stage.core
-    dt = core.task.sim.policy_dt
-    total, step = length(seconds, fps), 0
-    try:
-        observation = core.reset()
-        measured = deque([_velocity(core, env)], maxlen=max(1, round(AVERAGE_TIME / dt)))
-        for k in range(total):
-            while (step + 0.5) * dt < k / fps:
-                result = core.step(policy(observation))
-                core.check(result)
-                observation = result.observation
-                step += 1
-                ended = bool(result.terminated[env] or result.truncated[env])
-                if ended:
-                    measured.clear()
-                measured.append(_velocity(core, env))
-                if diagram:
+    def pictures() -> Iterator[Picture]:
+        dt = core.task.sim.policy_dt
+        total, step = length(seconds, fps), 0
+        try:
+            observation = core.reset()
+            measured = deque([_velocity(core, env)], maxlen=max(1, round(AVERAGE_TIME / dt)))
+            for k in range(total):
+                while (step + 0.5) * dt < k / fps:
+                    result = core.step(policy(observation))
+                    core.check(result)
+                    observation = result.observation
+                    step += 1
+                    ended = bool(result.terminated[env] or result.truncated[env])
                     if ended:
-                        diagram.clear()
-                    diagram.add(core.snapshot().foot_contact[env].tolist())
-            picture = camera.frame(env)
-            if caption:
-                _write_caption(picture, step * dt, core.command.value[env].tolist(), np.mean(measured, 0).tolist())
-            if diagram:
-                picture = diagram.under(picture)
-            on_frame(k + 1, total)
-            yield picture
-    finally:
-        camera.close()
+                        measured.clear()
+                    measured.append(_velocity(core, env))
+                    if diagram:
+                        if ended:
+                            diagram.clear()
+                        diagram.add(core.snapshot().foot_contact[env].tolist())
+                picture = camera.frame(env)
+                if caption:
+                    _write_caption(picture, step * dt, core.command.value[env].tolist(), np.mean(measured, 0).tolist())
+                if diagram:
+                    picture = diagram.under(picture)
+                on_frame(k + 1, total)
+                yield picture
+        finally:
+            camera.close()
+
+    return pictures()
 
 
 def length(seconds: float, fps: float) -> int:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from go1exp import robot
 from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import (
     ConfigError,
@@ -23,10 +24,11 @@ from go1exp.config.schema.registry import (
 from go1exp.config.schema.settings import parse, settings
 from go1exp.evaluate.controller.types import TrunkVelocity
 from go1exp.evaluate.protocol.claims import Claim
-from go1exp.evaluate.quantities import FINGERPRINT, LIFE, Column, Derived, Row
+from go1exp.evaluate.protocol.plan import Motion
+from go1exp.evaluate.quantities import FINGERPRINT, LIFE, Column, Derived, Row, add_measures, columns_of
+from go1exp.mdp.measures import measured
 
 if TYPE_CHECKING:
-    from go1exp.evaluate.protocol.plan import Motion
     from go1exp.evaluate.protocol.stage import Stage
 
 Count = Annotated[int, Field(ge=1)]
@@ -143,9 +145,6 @@ class Protocol:
 
     def columns(self) -> tuple[Column, ...]:
         """Return every figure of a robot."""
-        from go1exp import robot
-        from go1exp.evaluate.quantities import columns_of
-
         return (*LIFE, *self.robot_columns, *columns_of(self.terms(), robot.LEGS))
 
     def policy_velocities(self) -> dict[str, TrunkVelocity]:
@@ -182,10 +181,6 @@ class Protocol:
 
     def measure(self, motion: Motion, rows: Sequence[Row]) -> None:
         """Write the measures of a recorded motion into the rows of its robots."""
-        from go1exp import robot
-        from go1exp.evaluate.quantities import add_measures
-        from go1exp.mdp.measures import measured
-
         if motion.trace is not None and self.terms():
             add_measures(rows, measured(motion.trace, self.terms()), robot.LEGS)
 

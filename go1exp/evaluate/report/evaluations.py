@@ -7,19 +7,17 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from go1exp import robot
 from go1exp.config.schema.registry import ConfigError, unknown_name
+from go1exp.evaluate.protocol.base import Chosen, Protocol, chosen
 from go1exp.evaluate.quantities import COLUMNS, DRAW, FELL, FILE, KEYS, MOVING, ROBOT, Column, columns_of, rows_file
 from go1exp.evaluate.report.study import Run, Study
 from go1exp.mdp.measures import every_measure
-
-if TYPE_CHECKING:
-    from go1exp.evaluate.protocol.base import Chosen, Protocol
 
 GRID = "grid"
 PROTOCOLS = "protocols"
@@ -159,8 +157,6 @@ def _read(name: str, file: Path) -> RunRows:
         if ROBOT not in table:
             raise ValueError(f"its rows have no column {ROBOT!r}")
         return RunRows(table, settings, tuple(key for key in KEYS if key in table), None)
-    from go1exp.evaluate.protocol.base import chosen
-
     if not isinstance(about.get("kind"), str) or not isinstance(about.get("settings"), dict):
         raise ConfigError(["it has no kind, or no settings, of a protocol"])
     protocol = chosen({name: {**about["settings"], "term": about["kind"]}})[0][0].protocol

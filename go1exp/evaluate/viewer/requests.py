@@ -20,7 +20,7 @@ from go1exp.sim.effects.base import Param
 from go1exp.sim.effects.rules import actuator_problems
 from go1exp.sim.effects.tolerances import Tolerances
 from go1exp.sim.task import TaskConfig, parse_parts
-from go1exp.sim.terrain import TerrainConfig
+from go1exp.sim.terrain import TerrainConfig, build_terrain
 
 Velocity = tuple[float, float, float]
 """x and y, m/s, and yaw rate, rad/s, in the trunk's frame."""
@@ -257,8 +257,6 @@ class Ground:
 
 def grounds(files: Mapping[str, TerrainConfig]) -> dict[str, Ground]:
     """Return every ground by name: those of ``conf/terrain`` or of a run, and the lanes of the protocols."""
-    from go1exp.sim.terrain import build_terrain
-
     known: dict[str, Ground] = {}
     for name, config in files.items():
         if config.kind == "flat":

@@ -16,6 +16,7 @@ from mujoco.studio.implot import implot
 from numpy.typing import NDArray
 
 from go1exp import robot
+from go1exp.base.tensors.rotation import rotate_inverse
 from go1exp.deploy.sim_robot.machine import TICK, Body
 from go1exp.deploy.sim_robot.server import TRUTH
 from go1exp.evaluate.viewer import requests as ask
@@ -210,11 +211,9 @@ def longest(t: Array, values: Array, most: int) -> tuple[Array, Array]:
 
 def in_trunk(truth: dict[str, Array]) -> tuple[Array, Array]:
     """Return the trunk's velocity forward and to the left, (R,) each, m/s, of columns of ``server.TRUTH``."""
-    w, x, y, z = (truth[f"base_quat_{part}"] for part in "wxyz")
-    a, b, c = (truth[f"base_lin_vel_{axis}_w"] for axis in "xyz")
-    # The first two columns of the attitude's matrix, times the velocity in the world.
-    forward = (1 - 2 * (y * y + z * z)) * a + 2 * (x * y + w * z) * b + 2 * (x * z - w * y) * c
-    left = 2 * (x * y - w * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z + w * x) * c
+    quat = np.stack([truth[f"base_quat_{part}"] for part in "wxyz"], axis=1)
+    velocity = np.stack([truth[f"base_lin_vel_{axis}_w"] for axis in "xyz"], axis=1)
+    forward, left, _ = rotate_inverse(torch.from_numpy(quat), torch.from_numpy(velocity)).numpy().T
     return forward, left
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +15,8 @@ from go1exp.config.schema.registry import protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Played, bands, rounded
 from go1exp.evaluate.protocol.kinds.steady import ERRORS, Steady, by_axis, command_text
+from go1exp.evaluate.protocol.plan import Motion
 from go1exp.evaluate.quantities import Column, Row
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from go1exp.evaluate.protocol.plan import Motion
 
 RISEN = 0.9
 """Share of the steady-state velocity at which a step has risen."""
@@ -89,7 +85,7 @@ def step_answer(along: NDArray[Any], step: int, settle: int, dt: float) -> Row:
     return {"answer": reached, "rise_s": rise, "overshoot": over}
 
 
-def _answers(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+def _answers(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> plots.Figure:
     first = next(iter(summaries.values()))
     figure, axes = plots.panels(1, height=0.35 + 0.24 * len(first) * max(1, 0.6 * len(summaries)))
     ax = axes[0, 0]
@@ -113,7 +109,7 @@ def _answers(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
     return figure
 
 
-def _steps(curves: Mapping[str, Any]) -> Figure:
+def _steps(curves: Mapping[str, Any]) -> plots.Figure:
     names = list(curves["along"])
     columns = 3
     figure, axes = plots.panels(-(-len(names) // columns), columns, height=1.1, sharex=True, sharey=True)

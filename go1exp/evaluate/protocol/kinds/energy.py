@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +17,9 @@ from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Played
 from go1exp.evaluate.protocol.kinds.gait import straight
 from go1exp.evaluate.protocol.kinds.steady import ERRORS, Steady
+from go1exp.evaluate.protocol.plan import Motion
 from go1exp.evaluate.quantities import Column, Row, add_measures
 from go1exp.mdp.measures.trace import Trace, mean_over
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from go1exp.evaluate.protocol.plan import Motion
 
 SATURATED = 0.99
 """Share of the peak torque from which on an actuator counts as saturated."""
@@ -115,7 +111,7 @@ def effort(trace: Trace) -> dict[str, NDArray[np.float64]]:
     }
 
 
-def _cost(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+def _cost(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> plots.Figure:
     figure, axes = plots.panels(1, height=2.3)
     ax = axes[0, 0]
     for k, (who, summary) in enumerate(summaries.items()):
@@ -129,7 +125,7 @@ def _cost(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
     return figure
 
 
-def _scatter(dots: Mapping[str, Any]) -> Figure:
+def _scatter(dots: Mapping[str, Any]) -> plots.Figure:
     figure, axes = plots.panels(1, 3, height=2.2)
     limits = zip(axes[0], dots.items(), robot.EFFORT_LIMIT, robot.VELOCITY_LIMIT, strict=True)
     for ax, (kind, points), peak, top in limits:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -15,14 +15,10 @@ from go1exp.config.schema.registry import protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Played, rounded
 from go1exp.evaluate.protocol.kinds.steady import ERRORS, Steady, by_axis, command_text
+from go1exp.evaluate.protocol.plan import Motion
 from go1exp.evaluate.quantities import Column, Row
 from go1exp.mdp.measures.gait import touchdown_phase
 from go1exp.mdp.measures.trace import find_runs
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from go1exp.evaluate.protocol.plan import Motion
 
 SHOWN = 1.5
 """Time of the gait diagram, s."""
@@ -98,7 +94,7 @@ def _asymmetry(duty: Sequence[float | None]) -> float | None:
     return max(abs(a - b) / (0.5 * (a + b)) for a, b in pairs) if all(a + b for a, b in pairs) else None
 
 
-def _diagram(feet: Mapping[str, Any]) -> Figure:
+def _diagram(feet: Mapping[str, Any]) -> plots.Figure:
     figure, axes = plots.panels(len(feet), height=0.75, sharex=True)
     for ax, (name, shown) in zip(axes[:, 0], feet.items(), strict=True):
         for foot, start, stop in shown["stances"]:
@@ -111,7 +107,7 @@ def _diagram(feet: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def _circle(feet: Mapping[str, Any]) -> Figure:
+def _circle(feet: Mapping[str, Any]) -> plots.Figure:
     columns = 3
     rows = -(-len(feet) // columns)
     figure, axes = plots.panels(rows, columns, height=1.75, subplot_kw={"projection": "polar"})
@@ -142,7 +138,7 @@ SPEED = (
 )
 
 
-def _over_speed(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+def _over_speed(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> plots.Figure:
     figure, axes = plots.panels(3, 2, sharex=True)
     for k, (who, summary) in enumerate(summaries.items()):
         at, entries = straight(summary)

@@ -18,12 +18,10 @@ from go1exp.evaluate.protocol.claims import evaluated
 from go1exp.evaluate.protocol.kinds.energy import POWER, effort
 from go1exp.evaluate.protocol.kinds.rate import LATEST_MS
 from go1exp.evaluate.protocol.kinds.steady import AXES, ERRORS, Steady, by_axis
+from go1exp.evaluate.protocol.plan import Motion, Plan
 from go1exp.evaluate.quantities import FELL, Column, Derived, Row, add_measures, summary
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from go1exp.evaluate.protocol.plan import Motion
     from go1exp.evaluate.protocol.stage import Stage
 
 
@@ -58,8 +56,6 @@ class Hardware(Steady):
 
     def play(self, stage: Stage) -> Played:
         """Play the commands without further delays, and again with them, for falls alone."""
-        from go1exp.evaluate.protocol.plan import Plan
-
         played = Steady.play(self, stage)
         for row in played.rows:
             row["delay_ms"] = 0.0
@@ -109,7 +105,7 @@ def _margin(rows: Sequence[Row]) -> float:
     return held
 
 
-def _items(hardware: Hardware, summary: Sequence[Mapping[str, Any]]) -> Figure:
+def _items(hardware: Hardware, summary: Sequence[Mapping[str, Any]]) -> plots.Figure:
     verdicts = [v for v in evaluated(hardware.claims, summary) if v.claim.at_most and np.isfinite(v.figure.estimate)]
     figure, axes = plots.panels(1, height=0.5 + 0.26 * max(len(verdicts), 1))
     ax = axes[0, 0]
@@ -126,7 +122,7 @@ def _items(hardware: Hardware, summary: Sequence[Mapping[str, Any]]) -> Figure:
     return figure
 
 
-def _falls(rows: Sequence[Row]) -> Figure:
+def _falls(rows: Sequence[Row]) -> plots.Figure:
     figure, axes = plots.panels(1, height=1.9)
     entries = summary(rows, ("delay_ms",), (FELL,))
     delays = [e["condition"]["delay_ms"] for e in entries]

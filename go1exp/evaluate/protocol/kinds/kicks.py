@@ -26,13 +26,11 @@ from go1exp.evaluate.protocol.base import (
     repeated,
     rounded,
 )
+from go1exp.evaluate.protocol.plan import Impulses, Motion, Plan
 from go1exp.evaluate.protocol.signals import Signal
 from go1exp.evaluate.quantities import Column, Row
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from go1exp.evaluate.protocol.plan import Motion
     from go1exp.evaluate.protocol.stage import Stage
 
 COARSE = 0.04
@@ -134,8 +132,6 @@ class Kicks(Protocol):
 
     def play(self, stage: Stage) -> Played:
         """Kick all robots, odd ones from the other side."""
-        from go1exp.evaluate.protocol.plan import Impulses, Plan
-
         t = stage.times(self.duration_s)
         side = self._sides()
         count = len(self.impulses)
@@ -259,7 +255,7 @@ def _smooth(values: NDArray[Any], width: float, dt: float) -> NDArray[Any]:
     return means.reshape(values.shape)
 
 
-def _run(run: Mapping[str, Any], every: int) -> Figure:
+def _run(run: Mapping[str, Any], every: int) -> plots.Figure:
     figure, axes = plots.panels(2, height=1.6, sharex=True)
     t, height, speed = (run[k][:: max(every, 1)] for k in ("t", "height", "speed"))
     axes[0, 0].plot(t, height, color=plots.MEASURED, lw=1.1, label="trunk height")
@@ -276,7 +272,7 @@ def _run(run: Mapping[str, Any], every: int) -> Figure:
     return figure
 
 
-def _around(kicks: Sequence[Mapping[str, Any]]) -> Figure:
+def _around(kicks: Sequence[Mapping[str, Any]]) -> plots.Figure:
     figure, axes = plots.panels(2, height=1.6, sharex=True)
     for k, kick in enumerate(kicks):
         colour = plots.COLOURS[k % len(plots.COLOURS)]
@@ -290,7 +286,7 @@ def _around(kicks: Sequence[Mapping[str, Any]]) -> Figure:
     return figure
 
 
-def _success(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+def _success(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> plots.Figure:
     figure, axes = plots.panels(1, height=2.2)
     ax = axes[0, 0]
     names = (("survived", "survival rate"), ("up", "still standing"), ("recovered", "recovered"))

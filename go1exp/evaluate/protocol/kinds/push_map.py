@@ -15,13 +15,11 @@ from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import Positive, protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Cause, Count, Impulse, Length, Played, Point, Protocol, lives
+from go1exp.evaluate.protocol.plan import Impulses, Motion, Plan
 from go1exp.evaluate.protocol.signals import Signal
 from go1exp.evaluate.quantities import Column, Derived, Row, values
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from go1exp.evaluate.protocol.plan import Motion
     from go1exp.evaluate.protocol.stage import Session, Stage
 
 Array = NDArray[np.float64]
@@ -103,8 +101,6 @@ class PushMap(Protocol):
 
     def play(self, stage: Stage) -> Played:
         """Let all walk once; from where they are then, kick them again and again, each in its own phase."""
-        from go1exp.evaluate.protocol.plan import Impulses, Plan
-
         t = stage.times(self.settle_s + self._look_s + self.watch_s)
         command = np.repeat(self.command.at(t)[:, None], self.count, 1)
         nothing = np.zeros((self.count, 1))
@@ -229,7 +225,7 @@ def _weakest(rows: Sequence[Row]) -> float:
     return float(_medians(rows).min())
 
 
-def _map(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+def _map(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> plots.Figure:
     figure, axes = plots.panels(1, height=4.0, subplot_kw={"projection": "polar"})
     ax = axes[0, 0]
     for k, (who, summary) in enumerate(summaries.items()):
@@ -256,7 +252,7 @@ def _map(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
     return figure
 
 
-def _phases(rows: Sequence[Row]) -> Figure:
+def _phases(rows: Sequence[Row]) -> plots.Figure:
     figure, axes = plots.panels(1, height=2.0)
     phases = sorted({row["phase"] for row in rows})
     each = [values([r for r in rows if r["phase"] == p], "impulse") for p in phases]

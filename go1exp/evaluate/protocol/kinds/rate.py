@@ -15,13 +15,11 @@ from go1exp.config.schema.registry import NonNegative, Positive, protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.controller.types import TrunkVelocity
 from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, lives, repeated
+from go1exp.evaluate.protocol.plan import Motion, Plan
 from go1exp.evaluate.protocol.signals import Signal
 from go1exp.evaluate.quantities import Column, Derived, Row, values
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from go1exp.evaluate.protocol.plan import Motion
     from go1exp.evaluate.protocol.stage import Stage
 
 LATEST_MS = 60.0
@@ -85,8 +83,6 @@ class Rate(Protocol):
 
     def play(self, stage: Stage) -> Played:
         """Play each rate with each velocity, all delays as one batch."""
-        from go1exp.evaluate.protocol.plan import Plan
-
         rows: list[Row] = []
         delay = np.repeat(np.array(self.delays_ms) * 1e-3, self.robots)
         for velocity in self.velocities:
@@ -147,7 +143,7 @@ def _rms(values: Any) -> float:
 SHOWN = (("rmse_xy", "RMSE xy (m/s)"), ("fell", "share that fell"), ("target_rate", "target rate (rad/s)"))
 
 
-def _over_rate(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+def _over_rate(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> plots.Figure:
     first = [e["condition"] for e in next(iter(summaries.values())) if "rate_hz" in e["condition"]]
     velocities = list(dict.fromkeys(c["velocity"] for c in first))
     delays = sorted({c["delay_ms"] for c in first})

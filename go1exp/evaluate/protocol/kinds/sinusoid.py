@@ -14,13 +14,11 @@ from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import Positive, protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, bands, lives, repeated, rounded
+from go1exp.evaluate.protocol.plan import Motion, Plan
 from go1exp.evaluate.protocol.signals import Sine, response
 from go1exp.evaluate.quantities import Column, Row
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from go1exp.evaluate.protocol.plan import Motion
     from go1exp.evaluate.protocol.stage import Stage
 
 AXES = ("x", "y", "yaw")
@@ -75,8 +73,6 @@ class Sinusoid(Protocol):
 
     def play(self, stage: Stage) -> Played:
         """Play all sines as one batch: the robots of one are neighbours."""
-        from go1exp.evaluate.protocol.plan import Plan
-
         t = stage.times(self.duration_s)
         command = np.concatenate([np.repeat(s.at(t)[:, None], self.robots, 1) for s in self.ladder], 1)
         listen = round(self.longest / stage.policy_dt) if self.terms() else None
@@ -141,7 +137,7 @@ def _curve(motion: Motion, robots: slice) -> dict[str, Any]:
     return {"t": rounded(motion.t[::EVERY]), **{name: rounded(values) for name, values in named.items()}}
 
 
-def _rows(curve: Mapping[str, Any]) -> Figure:
+def _rows(curve: Mapping[str, Any]) -> plots.Figure:
     figure, axes = plots.panels(3, sharex=True)
     t = curve["t"]
     mean, low, high, one, command = (
@@ -164,7 +160,7 @@ LOOKS = (("o", "-"), ("s", "--"), ("^", ":"), ("D", "-."))
 """Marker and line style of each amplitude; colours are the subjects'."""
 
 
-def _bode(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+def _bode(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> plots.Figure:
     figure, axes = plots.panels(3, 2, sharex=True)
     lines = [(who, a) for who, s in summaries.items() for a in dict.fromkeys(e["condition"]["amplitude"] for e in s)]
     amplitudes = list(dict.fromkeys(amplitude for _, amplitude in lines))

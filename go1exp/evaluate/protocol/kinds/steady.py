@@ -11,11 +11,11 @@ from pydantic import Field
 from go1exp.config.schema.registry import NonNegative, Positive
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, lives, repeated
+from go1exp.evaluate.protocol.plan import Motion, Plan
 from go1exp.evaluate.protocol.signals import Constant, Velocity
 from go1exp.evaluate.quantities import Column, Row, add_measures
 
 if TYPE_CHECKING:
-    from go1exp.evaluate.protocol.plan import Motion
     from go1exp.evaluate.protocol.stage import Stage
 
 AXES = ("x", "y", "yaw")
@@ -62,8 +62,6 @@ class Steady(Protocol):
 
     def play(self, stage: Stage) -> Played:
         """Play all commands as one batch."""
-        from go1exp.evaluate.protocol.plan import Plan
-
         t = stage.times(self.duration_s)
         signals = [Constant(velocity=c, rest=self.rest_s).at(t) for c in self.commands]
         command = np.repeat(np.stack(signals, 1), self.robots, axis=1)

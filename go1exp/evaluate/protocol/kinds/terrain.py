@@ -15,13 +15,11 @@ from go1exp.config.schema.registry import NonNegative, PositiveRange, Speed, pro
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, lives, repeated
 from go1exp.evaluate.protocol.ground import UNITS, GroundName, Lanes, goal
+from go1exp.evaluate.protocol.plan import Motion, Plan
 from go1exp.evaluate.quantities import Column, Derived, Row, values
 from go1exp.evaluate.statistics.intervals import Logistic, logistic_fit
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from go1exp.evaluate.protocol.plan import Motion
     from go1exp.evaluate.protocol.stage import Stage
 
 SHARES = {"at_half": 0.5, "at_95": 0.95}
@@ -107,8 +105,6 @@ class OnTerrain(Protocol):
 
     def play(self, stage: Stage) -> Played:
         """Play each ground at each speed, all difficulties as one batch."""
-        from go1exp.evaluate.protocol.plan import Plan
-
         rows: list[Row] = []
         for name, levels in self.ladders.items():
             lanes = Lanes(ground=name, levels=levels, seed=self.ground_seed)
@@ -172,7 +168,7 @@ def _where(rows: Sequence[Row], share: float, top: float) -> float:
     return float(np.clip(fit.where(share), 0.0, top))
 
 
-def _success(plays: Mapping[str, Played], summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+def _success(plays: Mapping[str, Played], summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> plots.Figure:
     grounds = list(dict.fromkeys(e["condition"]["ground"] for e in next(iter(summaries.values()))))
     columns = 2 if len(grounds) > 1 else 1
     figure, axes = plots.panels(-(-len(grounds) // columns), columns, height=1.6, sharey=True)
