@@ -1,22 +1,26 @@
-"""Figures of protocols on motions made by hand: effort, symmetry, touchdowns, thresholds of terrain, the map's area."""
+"""Parts of protocols: figures of motions made by hand, lanes of rising difficulty, commands over time, kicks."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
+import torch
 
-import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
 from go1exp import robot
 from go1exp.config.compose import compose
 from go1exp.evaluate.protocol.base import chosen
+from go1exp.evaluate.protocol.ground import COURSE, RESOLUTION, RUN_UP, SHAPES, TREAD, UNITS, Lanes, goal
 from go1exp.evaluate.protocol.kinds import gait, hardware, push_map, rate, terrain
 from go1exp.evaluate.protocol.kinds.energy import effort
-from go1exp.evaluate.protocol.plan import Motion
+from go1exp.evaluate.protocol.plan import Impulses, Kicker, Motion, heading
+from go1exp.evaluate.protocol.signals import Constant, Sine, Steps, phasors, response
 from go1exp.evaluate.protocol.stage import delay_of_effects
 from go1exp.mdp.measures.trace import Trace
 from go1exp.sim.task import parse_train
+from go1exp.sim.terrain import build_terrain
 
 STEPS, DT = 100, 0.02
 
@@ -143,3 +147,159 @@ def test_time_under_a_command_ends_with_the_fall() -> None:
     command[10:] = 1.0
     alive = (np.arange(STEPS) < 60)[:, None]
     assert motion(command=command, alive=alive).moving_s[0] == pytest.approx(50 * DT)
+
+
+def profile(lanes: Lanes, lane: int) -> tuple[np.ndarray, np.ndarray]:
+    """Distance from the start, and height, along the middle of a lane."""
+    terrain = build_terrain(lanes)
+    x = np.arange(0.0, goal(), RESOLUTION / 2)
+    y = terrain.tile_origins[0, lane, 1]
+    return x, terrain.height_at(np.stack([x, np.full_like(x, y)], 1))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_slopes_have_their_angle(sign: int) -> None:
+    lanes = Lanes(ground="slope_up" if sign > 0 else "slope_down", levels=(10.0, 30.0))
+    for lane, angle in enumerate((10.0, 30.0)):
+        x, height = profile(lanes, lane)
+        on = (x > RUN_UP + 0.1) & (x < RUN_UP + COURSE - 0.1)
+        np.testing.assert_allclose(np.polyfit(x[on], height[on], 1)[0], sign * np.tan(np.radians(angle)), rtol=1e-4)
+        assert (height[x <= RUN_UP] == 0.0).all()
+
+
+def test_stairs_have_their_rise_and_tread() -> None:
+    _, height = profile(Lanes(ground="stairs_up", levels=(0.1, 0.2)), 1)
+    levels = np.unique(height.round(6))
+    steps = levels[np.isclose(levels / 0.2, np.round(levels / 0.2), atol=1e-4)]
+    np.testing.assert_allclose(np.diff(steps), 0.2, atol=1e-5)
+    assert len(steps) == 1 + np.ceil(COURSE / TREAD)
+
+
+@pytest.mark.parametrize("ground", ["gravel", "waves", "boxes"])
+def test_the_difficulty_is_the_largest_height(ground: str) -> None:
+    terrain = build_terrain(Lanes(ground=ground, levels=(0.02, 0.1)))  # type: ignore[arg-type]
+    assert terrain.heights.max() == pytest.approx(0.1, rel=0.02)
+    assert terrain.heights.min() == 0.0
+    again = build_terrain(Lanes(ground=ground, levels=(0.02, 0.1)))  # type: ignore[arg-type]
+    assert np.array_equal(terrain.heights, again.heights)
+
+
+def test_every_lane_starts_on_flat_ground_and_its_end_is_on_the_map() -> None:
+    assert set(SHAPES) == set(UNITS)
+    for ground in UNITS:
+        terrain = build_terrain(Lanes(ground=ground, levels=(0.05, 0.1, 0.2)))  # type: ignore[arg-type]
+        assert terrain.tile_origins.shape == (1, 3, 3)
+        assert (terrain.tile_origins[..., 2] == 0.0).all()
+        assert terrain.extent[1] - 1.0 > goal() + 0.5  # starts differ by half a metre
+        assert terrain.extent[0] + 1.0 <= -0.5
+
+
+PERIOD = 3.5
+
+
+def test_steps_and_rests_begin_when_they_say() -> None:
+    t = np.arange(6) * 0.5
+    steps = Steps(velocities=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), hold=1.0)
+    assert steps.at(t)[:, 0].tolist() == [1, 1, 0, 0, 0, 0]
+    assert Constant(velocity=(2.0, 0.0, 1.0), rest=1.0).at(t)[:, 2].tolist() == [0, 0, 1, 1, 1, 1]
+
+
+@pytest.mark.parametrize("dt", [0.02, 0.013])
+@pytest.mark.parametrize(("gain", "lag"), [(1.0, 0.0), (0.8, 0.12), (1.1, -0.05)])
+def test_known_gain_and_lag_are_found(dt: float, gain: float, lag: float) -> None:
+    """Also under the gait's own motion, an offset, and with a period that is no whole number of samples."""
+    t = np.arange(round(35.0 / dt)) * dt
+    command = Sine(amplitude=(1.0, 0.5, 1.0), period=PERIOD).at(t)
+    gait = 0.2 * np.sin(2 * np.pi * 2.8 * t)[:, None]
+    answer = gain * Sine(amplitude=(1.0, 0.5, 1.0), period=PERIOD).at(t - lag) + gait + 0.1
+    answer[t < PERIOD] = 7.0  # the first period does not count
+    found_gain, found_lag, coherence = response(answer, command, t, PERIOD)
+    np.testing.assert_allclose(found_gain, gain, atol=6e-3)
+    np.testing.assert_allclose(found_lag, lag, atol=6e-3)
+    assert (coherence > 0.999).all()
+
+
+def test_periods_that_are_answered_differently_have_little_coherence() -> None:
+    t = np.arange(8750) * 0.02
+    command = Sine(amplitude=(1.0, 1.0, 1.0), period=PERIOD).at(t)
+    rng = np.random.default_rng(0)
+    _, _, coherence = response(rng.normal(size=command.shape), command, t, PERIOD)
+    assert (coherence < 0.2).all()
+
+
+def test_without_a_second_period_there_is_no_answer() -> None:
+    t = np.arange(100) * 0.02
+    command = Sine(amplitude=(1.0, 1.0, 1.0), period=PERIOD).at(t)
+    assert np.isnan(response(command, command, t, PERIOD)[0]).all()
+    assert len(phasors(command, t, PERIOD)) == 0
+
+
+# ---------------------------------------------------------------------- kicks
+
+
+class Free:
+    """A free-floating trunk as an engine of two robots, without gravity."""
+
+    MODEL = """<mujoco><option timestep="0.002" gravity="0 0 0"/><worldbody><body><freejoint/>
+    <geom type="box" size=".2 .1 .05" mass="12.5"/></body></worldbody></mujoco>"""
+
+    def __init__(self) -> None:
+        model = mujoco.MjModel.from_xml_string(self.MODEL)
+        self.model, self.data = model, [mujoco.MjData(model) for _ in range(2)]
+        self.qpos = torch.zeros(2, 7, dtype=torch.float64)
+        self.qvel = torch.zeros(2, 6, dtype=torch.float64)
+        self._applied = torch.zeros(2, 6, dtype=torch.float64)
+        self.qpos[:, 3] = 1.0
+
+    def applied(self) -> torch.Tensor:
+        return self._applied
+
+    def step(self, torque: torch.Tensor) -> None:
+        for k, data in enumerate(self.data):
+            data.qpos[:], data.qvel[:] = self.qpos[k].numpy(), self.qvel[k].numpy()
+            data.qfrc_applied[:] = self._applied[k].numpy()
+            mujoco.mj_step(self.model, data)
+            self.qpos[k], self.qvel[k] = torch.from_numpy(data.qpos.copy()), torch.from_numpy(data.qvel.copy())
+
+
+def kicked(backend: Free, impulses: Impulses, seconds: float) -> None:
+    kicker = Kicker(backend, 0.002, impulses)
+    for _ in range(round(seconds / 0.002)):
+        backend.step(torch.zeros(2, 12))
+    assert kicker.time == pytest.approx(seconds)
+
+
+def test_an_impulse_is_the_momentum_that_it_gives() -> None:
+    """Of a trunk that floats: m dv is the impulse, in the direction from its heading; others' forces stay."""
+    backend = Free()
+    backend.qpos[1, 3:7] = torch.tensor([np.cos(0.25), 0.0, 0.0, np.sin(0.25)])  # heading 0.5 rad
+    assert heading(backend.qpos[:, 3:7]).tolist() == pytest.approx([0.0, 0.5])
+    impulses = Impulses(
+        start=np.array([[0.1, 0.4], [0.1, np.nan]]),
+        size=np.array([[12.7, 6.4], [19.1, 5.0]]),
+        direction=np.array([[np.pi / 2, np.pi / 2], [0.0, 0.0]]),
+        duration=0.1,
+    )
+    kicked(backend, impulses, 1.0)
+    gained = 12.5 * backend.qvel[:, :3].numpy()
+    np.testing.assert_allclose(gained[0], [0.0, 12.7 + 6.4, 0.0], atol=1e-9)
+    np.testing.assert_allclose(gained[1], [19.1 * np.cos(0.5), 19.1 * np.sin(0.5), 0.0], atol=1e-9)
+    assert (backend.applied() == 0).all()
+
+
+def test_a_kick_beside_the_centre_turns_the_trunk() -> None:
+    """I dw is arm x impulse."""
+    backend = Free()
+    impulses = Impulses(np.full((2, 1), 0.0), np.full((2, 1), 3.0), np.full((2, 1), np.pi / 2), 0.002, (0.1, 0.0, 0.0))
+    kicked(backend, impulses, 0.01)
+    spin = backend.qvel[:, 5].numpy() * backend.model.body_inertia[1].max()
+    np.testing.assert_allclose(spin, 0.1 * 3.0, rtol=1e-3)
+
+
+def test_forces_of_others_are_kept_and_added_to() -> None:
+    backend = Free()
+    backend.applied()[:, 2] = 1.0
+    impulses = Impulses(np.zeros((2, 1)), np.full((2, 1), 3.0), np.zeros((2, 1)), 0.1)
+    kicked(backend, impulses, 0.2)
+    assert backend.applied()[:, 2].tolist() == [1.0, 1.0]
+    np.testing.assert_allclose(12.5 * backend.qvel[:, :3].numpy(), [[3.0, 0.0, 0.2]] * 2, atol=1e-9)
