@@ -147,12 +147,6 @@ def plain(interval: Interval, unit: str) -> dict[str, Any]:
     return {**rounded, "n": interval.n, "unit": unit}
 
 
-def resampled(rows: Sequence[Row]) -> tuple[int, Callable[[NDArray[np.intp]], list[Row]]]:
-    """Return the number of robots, and what gives the rows of some of them, one after the other."""
-    groups = list(by_condition(rows, (ROBOT,)).values())
-    return len(groups), lambda robots: [row for k in robots for row in groups[k]]
-
-
 # ---------------------------------------------------------------------- measures of gait and contact as columns
 
 BETTER: dict[str, Literal["lower", "higher"]] = {

@@ -163,7 +163,7 @@ def evaluate(
         observation = result.observation
         tally.add_step(result.terminated, result.truncated, dt)
         if step >= settle:
-            tally.add_velocity(_planar_velocity(core), core.command.value)
+            tally.add_velocity(planar_velocity(core), core.command.value)
             if recorder:
                 recorder.end_step(tally.alive)
         on_step(step + 1, steps)
@@ -204,8 +204,8 @@ def _agent(task: TaskConfig, policy: Policy | None, controller: Callable[[], Con
     return PolicyAgent("", task, policy)
 
 
-def _planar_velocity(core: Go1Core) -> torch.Tensor:
-    """Velocity of the trunk in its own frame (N, 3), float64: x and y in m/s, yaw rate in rad/s."""
+def planar_velocity(core: Go1Core) -> torch.Tensor:
+    """Return the velocity of the trunk in its own frame (N, 3), float64: x and y in m/s, yaw rate in rad/s."""
     s = core.snapshot()
     assert s.base_lin_vel_b is not None
     return torch.cat([s.base_lin_vel_b[:, :2], s.base_ang_vel_b[:, 2:]], dim=1).double()

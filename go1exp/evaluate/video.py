@@ -21,6 +21,7 @@ from PIL import Image, ImageDraw
 
 from go1exp.base.files import replacing
 from go1exp.evaluate.footfalls import Footfalls, font
+from go1exp.evaluate.rollout import planar_velocity
 from go1exp.mdp.commands import FixedVelocity
 from go1exp.sim.env.camera import (
     AZIMUTH,
@@ -95,7 +96,7 @@ def record(
         total, step = length(seconds, fps), 0
         try:
             observation = core.reset()
-            measured = deque([_velocity(core, env)], maxlen=max(1, round(AVERAGE_TIME / dt)))
+            measured = deque([planar_velocity(core)[env].tolist()], maxlen=max(1, round(AVERAGE_TIME / dt)))
             for k in range(total):
                 while (step + 0.5) * dt < k / fps:
                     result = core.step(policy(observation))
@@ -105,7 +106,7 @@ def record(
                     ended = bool(result.terminated[env] or result.truncated[env])
                     if ended:
                         measured.clear()
-                    measured.append(_velocity(core, env))
+                    measured.append(planar_velocity(core)[env].tolist())
                     if diagram:
                         if ended:
                             diagram.clear()
@@ -218,13 +219,6 @@ def _complete(path: Path) -> Iterator[Path]:
     except OSError as error:
         reason = f"cannot be written: {error.strerror or error}"
         raise OSError(error.errno or errno.EIO, reason, str(path)) from error
-
-
-def _velocity(core: Go1Core, env: int) -> list[float]:
-    """Velocity of the trunk in its own frame: x and y, m/s, and yaw rate, rad/s."""
-    s = core.snapshot()
-    assert s.base_lin_vel_b is not None
-    return [*s.base_lin_vel_b[env, :2].tolist(), float(s.base_ang_vel_b[env, 2])]
 
 
 def _write_caption(picture: Picture, seconds: float, command: Sequence[float], measured: Sequence[float]) -> None:

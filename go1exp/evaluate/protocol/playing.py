@@ -17,7 +17,7 @@ from go1exp.evaluate.agents import Agent, Progress
 from go1exp.evaluate.protocol.base import Chosen, Length, Played, Protocol
 from go1exp.evaluate.protocol.claims import Verdict, evaluated
 from go1exp.evaluate.protocol.stage import Rates, Setting, Stage
-from go1exp.evaluate.quantities import Derived, Row, about, distinct, plain, resampled, summary
+from go1exp.evaluate.quantities import ROBOT, Derived, Row, about, by_condition, distinct, plain, summary
 from go1exp.evaluate.statistics.intervals import Interval, bootstrap_interval
 
 
@@ -124,8 +124,8 @@ def summarised(chosen: Chosen, rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 def thresholds(derived: Derived, rows: Sequence[Row]) -> Interval:
     """Return a figure of all robots together with its interval."""
-    n, sample = resampled(about(rows, derived.condition))
-    return bootstrap_interval(lambda robots: derived.function(sample(robots)), n)
+    of_robots = list(by_condition(about(rows, derived.condition), (ROBOT,)).values())
+    return bootstrap_interval(lambda k: derived.function([r for n in k for r in of_robots[n]]), len(of_robots))
 
 
 # ---------------------------------------------------------------------- length

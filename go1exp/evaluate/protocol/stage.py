@@ -19,7 +19,7 @@ from go1exp.evaluate.agents import Agent, Progress
 from go1exp.evaluate.controller.types import TrunkVelocity
 from go1exp.evaluate.protocol.plan import STEP_BYTES, Array, Impulses, Kicker, Motion, Plan, heading
 from go1exp.evaluate.recorder import Recorder, bytes_per_step
-from go1exp.evaluate.rollout import DELAY, EvalConfig, delayed, evaluation_task, require_agreement
+from go1exp.evaluate.rollout import DELAY, EvalConfig, delayed, evaluation_task, planar_velocity, require_agreement
 from go1exp.mdp.commands import FixedVelocity
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TaskConfig
@@ -251,9 +251,7 @@ class Session:
     def _keep(self, kept: dict[str, Any], row: int) -> None:
         s = self.core.snapshot()
         assert s.base_pos_w is not None
-        assert s.base_lin_vel_b is not None
-        kept["velocity"][row, :, :2] = s.base_lin_vel_b[:, :2].numpy()
-        kept["velocity"][row, :, 2] = s.base_ang_vel_b[:, 2].numpy()
+        kept["velocity"][row] = planar_velocity(self.core).numpy()
         below = self.core.ground_height(s.base_pos_w[:, :2])
         kept["height"][row] = (s.base_pos_w[:, 2] - below).numpy()
         kept["way"][row] = s.base_pos_w[:, 0].numpy() - self._start[:, 0]

@@ -215,13 +215,8 @@ def _about(term: Any) -> str:
 
 
 HARDEST: dict[GroundName, float] = {
-    "slope_up": 30.0,
-    "slope_down": 30.0,
-    "gravel": 0.15,
-    "waves": 0.4,
-    "stairs_up": 0.25,
-    "stairs_down": 0.25,
-    "boxes": 0.3,
+    **{"slope_up": 30.0, "slope_down": 30.0, "stairs_up": 0.25, "stairs_down": 0.25},
+    **{"gravel": 0.15, "waves": 0.4, "boxes": 0.3},
 }
 """Largest difficulty of each lane, in the unit of ``protocol.ground.UNITS`` (chosen: beyond all shipped policies)."""
 

@@ -18,7 +18,7 @@ from go1exp.config.schema.registry import ConfigError, Term
 from go1exp.deploy.estimation import EstimatorError
 from go1exp.evaluate.agents import Agent, VelocityFilters
 from go1exp.evaluate.protocol.plan import Impulses, Kicker, heading
-from go1exp.evaluate.rollout import require_agreement
+from go1exp.evaluate.rollout import planar_velocity, require_agreement
 from go1exp.evaluate.viewer import requests
 from go1exp.evaluate.viewer.requests import Ground, Setup, task_under
 from go1exp.mdp.derived import clipped
@@ -312,12 +312,11 @@ class Session:
     def _remember(self) -> None:
         s, core = self.core.snapshot(), self.core
         assert s.base_pos_w is not None
-        assert s.base_lin_vel_b is not None
         below = core.ground_height(s.base_pos_w[:, :2])
         reward = np.array([float(v[0]) for v in core.reward_terms().values()]) / self.dt
         row: dict[str, Vector] = {
             "command": np.array(self.command),
-            "true": np.array([*s.base_lin_vel_b[0, :2].tolist(), float(s.base_ang_vel_b[0, 2])]),
+            "true": planar_velocity(core)[0].numpy(),
             "height": (s.base_pos_w[:, 2] - below).double().numpy(),
             "torque": s.joint_torque[0].abs().double().numpy() / self._limit,
             "contact": s.foot_contact[0].double().numpy(),
