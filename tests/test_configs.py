@@ -60,13 +60,18 @@ def choices() -> list[str]:
     return found
 
 
-OF_THE_STUDY = ("none", "no_curriculum", "no_adaptive_rate", "no_latency", "no_actuator_net")
-"""Ablations of ``experiment=study``, which has what they take away; tested below."""
+WITHOUT_RAMP = {"no_raised_weight": [], "no_close_kernels": ["track", "turn"], "no_diagonal_load": ["begin"]} | {
+    "no_touchdown_speed": [],
+    "no_widening": ["slow", "axes"],
+    "no_phases": [],
+    "no_schedule": [],
+    "no_mirrored_samples": [],
+}
+"""Ablations of departures from the paper, and the ramps of ``schedule=paper`` that go with them."""
 
+OTHERS = {"none", "no_curriculum", "no_latency", *WITHOUT_RAMP}
 ABLATIONS = [
-    c.removeprefix("experiment=ablation/")
-    for c in choices()
-    if c.startswith("experiment=ablation/") and not c.endswith(tuple(f"/{name}" for name in OF_THE_STUDY))
+    name for c in choices() if c.startswith("experiment=ablation/") and (name := c.split("/")[1]) not in OTHERS
 ]
 NEEDS = {"curriculum=terrain_level": ["terrain=rough"]}
 
@@ -200,38 +205,54 @@ def test_the_walking_study_changes_one_part_of_the_five_minutes_each() -> None:
         assert flat(container) == {**base, **changes}
 
 
-@pytest.mark.parametrize("recipe", ["study", "study_cpu"])
-def test_the_study_takes_one_part_of_the_recipe_away_each(recipe: str) -> None:
-    base = flat(compose("train", [f"experiment={recipe}"]))
-    drive = "actuator.drive."
-    expected = {
-        "none": base,
-        "no_curriculum": {k: v for k, v in base.items() if not k.startswith("curriculum.")},
-        "no_adaptive_rate": {**base, "ppo.schedule": "fixed"},
-        "no_latency": {**base, "actuator.command": [0.0, 0.0]},
-        "no_actuator_net": {
-            **{k: v for k, v in base.items() if not k.startswith(drive)},
-            **{f"{drive}{k}": v for k, v in flat(compose("train", ["actuator=pd"])["actuator"]).items()},
-        },
+def test_the_study_takes_one_departure_away_each() -> None:
+    base = flat(compose("train", ["experiment=study"]))
+    printed = {"reward.linear_velocity_error.weight": 5.0, "reward.linear_velocity_error.ramp": 0.0}
+    changes: dict[str, dict[str, Any]] = {
+        "none": {},
+        "no_latency": {"actuator.command": [0.0, 0.0]},
+        "no_raised_weight": printed,
+        "no_close_kernels": {f"reward.close_{kind}_velocity.weight": 0.0 for kind in ("linear", "angular")},
+        "no_diagonal_load": {"reward.diagonal_load.weight": 0.0},
+        "no_touchdown_speed": {"reward.touchdown_speed.weight": 0.0},
+        "no_mirrored_samples": {"ppo.symmetry": False},
+        "no_widening": {"command.start": 1.0, "command.zero_fraction": 0.0, "command.slow_fraction": 0.0},
     }
-    assert {*expected} == {*OF_THE_STUDY}
-    assert base["ppo.schedule"] == "adaptive"
-    for name, values in expected.items():
-        container = compose("train", [f"experiment={recipe}", f"+experiment/ablation={name}"])
+    for name, values in changes.items():
+        container = compose("train", ["experiment=study", f"+experiment/ablation={name}"])
         parse_train(container)
-        assert flat(container) == values, name
-        assert name == "none" or values != base
+        gone = [f"schedule.{ramp}" for ramp in WITHOUT_RAMP.get(name, [])]
+        kept = {key: value for key, value in base.items() if not key.startswith(tuple(f"{g}." for g in gone))}
+        assert flat(container) == {**kept, **dict.fromkeys(gone), **values}, name
 
 
-@pytest.mark.parametrize("study", ["ablations", "ablations_cpu"])
-def test_a_study_has_every_part_of_the_recipe_by_five_seeds(study: str) -> None:
-    params = OmegaConf.to_container(OmegaConf.load(CONF / f"study/{study}.yaml").hydra.sweeper.params)
+def test_without_phases_or_a_schedule() -> None:
+    literal = flat(compose("train", ["reward=paper_literal"]))
+    task = compose("train", ["experiment=study", "+experiment/ablation=no_phases"])
+    parse_train(task)
+    seconds = {k: v for k, v in flat(task).items() if k.startswith("reward.gait_in_seconds.")}
+    assert seconds.pop("reward.gait_in_seconds.term") == "gait"
+    assert seconds == {k.replace(".gait.", ".gait_in_seconds."): v for k, v in literal.items() if ".gait." in k}
+    assert flat(task)["reward.gait.weight"] == 0.0
+    assert {ramp["when"]["measure"] for ramp in task["schedule"].values()} == {"reward/gait_in_seconds"}
+    bare = compose("train", ["experiment=study", "+experiment/ablation=no_schedule"])
+    parse_train(bare)
+    assert not bare["schedule"]
+
+
+def test_a_curriculum_is_taken_away() -> None:
+    base = flat(compose("train", ["experiment=paper"]))
+    without = flat(compose("train", ["experiment=[paper,ablation/no_curriculum]"]))
+    assert without == {k: v for k, v in base.items() if not k.startswith("curriculum.")} != base
+
+
+def test_the_study_has_24_parts_by_three_seeds() -> None:
+    params = OmegaConf.to_container(OmegaConf.load(CONF / "study/ablations.yaml").hydra.sweeper.params)
     assert isinstance(params, dict)
-    assert params["seed"] == "0,1,2,3,4"
+    assert params["seed"] == "0,1,2"
     names = {name.strip() for name in params["+experiment/ablation"].split(",")}
-    rows = {f"no_rand_{term}" for term in TABLE_1} | {"no_rand", "no_push", "no_noise"}
-    tracking = {"no_linear_velocity_error", "no_angular_velocity_error"}
-    assert names == {*REWARD_GROUPS, *OF_THE_STUDY, *rows, *tracking}
+    assert len(names) == 24
+    assert {*REWARD_GROUPS, *WITHOUT_RAMP, "none", "no_rand", "no_push", "no_noise", "no_latency"} < names
 
 
 def test_the_command_line_beats_an_experiment() -> None:

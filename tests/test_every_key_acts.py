@@ -85,7 +85,7 @@ EXEMPT = {
     "backend/warp.yaml:backend": "needs a GPU and an extra: tests/contracts/test_backends.py",
     "controller/mpc.yaml:controller": "tests/test_controller.py shows what each key does",
     "controller/policy.yaml:controller": "the name of the choice",
-    "experiment/ablation/no*_smoothness.yaml:schedule.smooth": "a ramp that is taken away with its row",
+    "experiment/ablation/*.yaml:schedule": "ramps that are taken away with their rows, or wait for another one",
     "reward/paper_literal.yaml:reward.air_time_variance.weight": "as printed, the term is zero for every gait",
     "launcher/*.yaml:launcher": "needs several cores, or a cluster: tests/test_sweeps.py, test_slurm.py",
     "study/*.yaml:study": "jobs of a sweep: tests/test_configs.py",
@@ -132,8 +132,11 @@ EXEMPT = {
 
 NEEDS = {
     **{
-        f"experiment/{name}": ["schedule=none"]  # which sets the weight of action_smoothness
-        for name in ("ablation/no_action_smoothness", "ablation/no_smoothness", "five_minutes_part/no_smoothness")
+        f"experiment/{name}": ["schedule=none"]  # which sets these rows
+        for name in (
+            *("ablation/no_action_smoothness", "ablation/no_smoothness", "five_minutes_part/no_smoothness"),
+            *("ablation/no_raised_weight", "ablation/no_diagonal_load", "ablation/no_touchdown_speed"),
+        )
     },
     "reward/paper": ["schedule=none"],  # which sets three of its weights
     "curriculum/terrain_level": ["terrain=rough"],
@@ -147,11 +150,9 @@ NEEDS = {
     "command/widening": ["schedule=none"],  # which begins without slow commands
     **{f"contact/{name}": ["schedule=none"] for name in ("elliptic", "soft", "stiff")},  # it begins on soft ground
     "experiment/ablation/no_latency": ["actuator=delay"],
-    "experiment/ablation/no_adaptive_rate": ["ppo=paper"],
-    "experiment/five_minutes_part/no_mirrored_samples": ["ppo=small"],
+    **{f"experiment/{part}/no_mirrored_samples": ["ppo=small"] for part in ("ablation", "five_minutes_part")},
     "experiment/five_minutes_part/no_near_kernels": ["experiment=five_minutes"],
-    "experiment/study": ["experiment=paper", "actuator=delay", "backend=cpu"],
-    "experiment/study_cpu": ["experiment=study", "backend=cpu", "ppo=small"],
+    "experiment/study": ["backend=cpu", "ppo=warp"],
     "experiment/robust": ["experiment=clock", "backend=cpu"],
     "experiment/robust_history": ["experiment=robust", "backend=cpu"],
 }

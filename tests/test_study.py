@@ -66,7 +66,7 @@ def test_the_study_is_killed_half_way_gone_on_with_and_reported(
 ) -> None:
     parts = ("seed=0,1", "+experiment/ablation=none,no_gait_shaping", *SMALLER)
     chosen = (f"hydra/launcher={launcher}", *LAUNCHERS[launcher], "hydra.sweep.dir=study")
-    killed_half_way(["train", "-m", "study=ablations_cpu", *parts, *chosen], tmp_path, variables)
+    killed_half_way(["train", "-m", "study=ablations", "backend=cpu", *parts, *chosen], tmp_path, variables)
     states = [job.state for job in index.read(tmp_path / "study").jobs]
     assert len(states) == 4
     assert "done" not in states

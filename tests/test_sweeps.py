@@ -163,10 +163,10 @@ def test_a_damaged_index_and_a_job_that_may_not_change_are_named(sweep: Path, tm
 
 
 def test_a_study_without_m_is_refused_with_the_line_to_type(tmp_path: Path) -> None:
-    line = ("study=ablations_cpu", "seed=3", "hydra/launcher=joblib")
+    line = ("study=ablations", "seed=3", "hydra/launcher=joblib")
     done = cli(tmp_path, "train", *line, preload=LIGHT)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
-    assert f"study=ablations_cpu: is a sweep and needs -m: go1exp train -m {' '.join(line)}\n" in done.stderr
+    assert f"study=ablations: is a sweep and needs -m: go1exp train -m {' '.join(line)}\n" in done.stderr
     assert [p for p in tmp_path.rglob("*") if p.name != "runs"] == []
     shown = cli(tmp_path, "train", *line, "--cfg", "job", preload=LIGHT)
     assert shown.returncode == 0, shown.stderr
@@ -174,7 +174,7 @@ def test_a_study_without_m_is_refused_with_the_line_to_type(tmp_path: Path) -> N
 
 
 def test_what_the_command_line_says_of_a_key_replaces_what_a_study_says(tmp_path: Path) -> None:
-    line = ("-m", "study=ablations_cpu", "seed=-1,-2", "+experiment/ablation=no_gait,no_latency")
+    line = ("-m", "study=ablations", "backend=cpu", "seed=-1,-2", "+experiment/ablation=no_gait,no_latency")
     done = cli(tmp_path, "train", *line, preload=LIGHT)
     assert done.returncode == 2
     assert "seed = -1" in done.stderr
