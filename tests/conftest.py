@@ -213,3 +213,9 @@ def make_net(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
         return path
 
     return make
+
+
+@pytest.fixture
+def elsewhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A folder of its own, as MuJoCo writes its warnings to a file where it runs."""
+    monkeypatch.chdir(tmp_path)

@@ -202,7 +202,6 @@ def test_the_ground_is_scanned_only_for_whom_reads_it_and_is_that_of_the_terrain
     core.reset()
     s = core.snapshot()
     assert s.height_scan is not None
-    assert s.base_pos_w is not None
     middle = s.height_scan[:, 187 // 2] + s.base_pos_w[:, 2]
     torch.testing.assert_close(middle, core.ground_height(s.base_pos_w[:, :2]), rtol=0.0, atol=1e-5)
     observed = core.step(torch.zeros(4, 12)).observation[:, O + C :]

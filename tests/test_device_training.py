@@ -280,14 +280,7 @@ def test_a_fault_in_the_environment_is_found_after_the_rollout_with_its_moment(l
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no CUDA device")
 @pytest.mark.parametrize("option", ["ppo.symmetry=false", "ppo.symmetry=true", "ppo.max_kl=0.001"])
 def test_a_recorded_gradient_step_is_the_called_one_and_goes_on_from_a_checkpoint(tmp_path: Path, option: str) -> None:
-    overrides = (
-        *SMALL,
-        option,
-        "backend=warp",
-        "ppo.epochs=3",
-        "ppo.init_std=0.5",
-        "ppo.desired_kl=0.0005",
-    )
+    overrides = (*SMALL, option, "backend=warp", "ppo.epochs=3", "ppo.init_std=0.5", "ppo.desired_kl=0.0005")
     config = parse_train(compose("train", [o for o in overrides if "threads" not in o]))
     found = []
     for captures in (True, False):

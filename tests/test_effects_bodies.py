@@ -191,29 +191,25 @@ def with_bodies(loads: Mapping[str, tuple[float, tuple[float, float, float]]]) -
     return spec.compile()
 
 
-@pytest.mark.parametrize(("mass", "at"), [(3.0, (0.1, -0.05, 0.12)), (0.4, (-0.2, 0.0, -0.1))])
-def test_a_payload_is_a_body_on_the_trunk(mass: float, at: tuple[float, float, float]) -> None:
-    values = {"mass": mass, **dict(zip("xyz", at, strict=True))}
-    edited, real = engine(rig({"payload": values}, held=None)).env_model(0), with_bodies({"trunk": (mass, at)})
+@pytest.mark.parametrize(
+    ("effect", "links", "mass", "at"),
+    [
+        ("payload", ["trunk"], 3.0, (0.1, -0.05, 0.12)),
+        ("payload", ["trunk"], 0.4, (-0.2, 0.0, -0.1)),
+        ("point_load", [f"{leg}_calf" for leg in robot.LEGS], 0.15, (0.01, -0.02, -0.213)),
+        ("point_load", [f"{leg}_thigh" for leg in robot.LEGS], 0.15, (0.0, 0.03, -0.1)),
+    ],
+)
+def test_a_load_is_a_body_on_its_link(
+    effect: str, links: list[str], mass: float, at: tuple[float, float, float]
+) -> None:
+    """Mass matrix, gravity and Coriolis torques against a robot compiled with such bodies."""
+    share: Any = {link: mass for link in links} if effect == "point_load" else mass
+    edited = engine(rig({effect: {"mass": share, **dict(zip("xyz", at, strict=True))}}, held=None)).env_model(0)
+    real = with_bodies({link: (mass, at) for link in links})
     a, b = somewhere(edited), somewhere(real)
-    assert edited.body_mass.sum() == pytest.approx(real.body_mass.sum(), rel=1e-12)
     assert edited.body_subtreemass[1] == pytest.approx(real.body_subtreemass[1], rel=1e-12)
     assert np.allclose(a.subtree_com[1], b.subtree_com[1], atol=1e-12)
-    assert np.allclose(mass_matrix(edited, a), mass_matrix(real, b), atol=1e-9)
-    a.qvel[:] = b.qvel[:] = np.random.default_rng(1).normal(0.0, 3.0, 18)
-    mujoco.mj_forward(edited, a)
-    mujoco.mj_forward(real, b)
-    assert np.allclose(a.qfrc_bias, b.qfrc_bias, atol=1e-7)
-
-
-@pytest.mark.parametrize(("part", "at"), [("calf", (0.01, -0.02, -0.213)), ("thigh", (0.0, 0.03, -0.1))])
-def test_a_point_load_is_a_body_on_the_link(part: str, at: tuple[float, float, float]) -> None:
-    """Mass matrix, gravity and Coriolis torques against a robot compiled with such bodies on all four legs."""
-    effect = {"mass": {part: 0.15}, **dict(zip("xyz", at, strict=True))}
-    edited = engine(rig({"point_load": effect}, held=None)).env_model(0)
-    real = with_bodies({f"{leg}_{part}": (0.15, at) for leg in robot.LEGS})
-    a, b = somewhere(edited), somewhere(real)
-    assert edited.body_subtreemass[1] == pytest.approx(real.body_subtreemass[1], rel=1e-12)
     assert np.allclose(mass_matrix(edited, a), mass_matrix(real, b), atol=1e-9)
     a.qvel[:] = b.qvel[:] = np.random.default_rng(1).normal(0.0, 3.0, 18)
     mujoco.mj_forward(edited, a)

@@ -145,10 +145,7 @@ def test_one_member_exchanges_nothing() -> None:
         (("devices=2",), "devices = 2: needs backend=warp"),
         (("devices=3", "ppo.num_envs=256"), "devices = 3: ppo.num_envs = 256 must be 64 or more for each"),
         (("devices=2", "ppo.num_envs=66"), "devices = 2: ppo.num_envs = 66 must be 64 or more for each"),
-        (
-            ("devices=4", "ppo.num_envs=256", "ppo.minibatches=512"),
-            "a minibatch (256 x 4 / 512) must be a multiple",
-        ),
+        (("devices=4", "ppo.num_envs=256", "ppo.minibatches=512"), "a minibatch (256 x 4 / 512) must be a multiple"),
     ],
 )
 def test_a_training_that_cannot_be_shared_out_is_refused(overrides: tuple[str, ...], what: str) -> None:

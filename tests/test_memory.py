@@ -52,18 +52,12 @@ def test_a_gif_that_does_not_fit_is_refused_by_its_key_and_a_film_is_not(
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (
-            ("repeats=1000",),
-            "repeats = 1000: 1003 recordings of 20 s: it takes at least .*; 7 at most would fit",
-        ),
+        (("repeats=1000",), "repeats = 1000: 1003 recordings of 20 s: it takes at least .*; 7 at most would fit"),
         (("gains=[[20,0.5],[35,0.6]]", "repeats=9"), "repeats = 9: 24 recordings of 20 s: .*; 2 at most would fit"),
         (("seconds=1e9",), "seconds = 1e\\+09: with 3 recordings it takes .*; 66 s at most would fit"),
         (("seconds=100", "repeats=2"), "seconds = 100: with 5 recordings .*; 40 s at most would fit"),
         (("seconds=1e308",), "seconds = 1e\\+308: with 3 recordings it takes at least inf GB, .*; 66 s at most would"),
-        (
-            ("excitation=[policy]", "policy=clock", "episodes=11"),
-            "episodes = 11: 11 .*; 10 at most would fit",
-        ),
+        (("excitation=[policy]", "policy=clock", "episodes=11"), "episodes = 11: 11 .*; 10 at most would fit"),
         (("excitation=[policy]", "policy=clock", "seconds=201"), "seconds = 201: with 4 recordings .*; 50 s at most"),
     ],
 )

@@ -117,10 +117,7 @@ TROT_PHASE = {"foot_air_time": feet(FR=0.1, RL=0.1), "foot_contact_time": feet(F
 PACE_PHASE = {"foot_air_time": feet(FR=0.1, RR=0.1), "foot_contact_time": feet(FL=0.1, RL=0.1)}
 BOUND_PHASE = {"foot_air_time": feet(FR=0.1, FL=0.1), "foot_contact_time": feet(RR=0.1, RL=0.1)}
 PRONK_PHASE = {"foot_air_time": [0.1] * 4, "foot_contact_time": [0.0] * 4}
-LANDING = {
-    "foot_touchdown_speed": [1.5, 2.0, 0.5, 9.0],
-    "foot_touchdown": [True, False, True, False],
-}
+LANDING = {"foot_touchdown_speed": [1.5, 2.0, 0.5, 9.0], "foot_touchdown": [True, False, True, False]}
 QUARTER = {"command": WALK, "episode_time": 0.1}
 APART = {"foot_air_time": [0.0, 1.0, 2.0, 3.0], "foot_contact_time": [10.0, 20.0, 30.0, 40.0]}
 SLIDING = {
@@ -128,9 +125,7 @@ SLIDING = {
     "foot_contact": [True, False, True, True],
 }
 TENTH_OFF = [q + 0.1 for q in robot.NOMINAL_STANCE]
-FAST = {
-    "joint_vel": [30.2, 30.0, 20.1, -30.2, -30.0, -20.1, 30.05, 30.2, 20.0, 0.0, -30.2, -20.0],
-}
+FAST = {"joint_vel": [30.2, 30.0, 20.1, -30.2, -30.0, -20.1, 30.05, 30.2, 20.0, 0.0, -30.2, -20.0]}
 """Above 30.1, 30.1 and 20.06 rad/s: FR hip and calf and RR thigh forwards, FL hip and calf and RL thigh backwards."""
 
 CASES = [
@@ -166,11 +161,7 @@ CASES = [
     Case("feet_air_time", "drifting at 0.42 m/s is standing", {"base_lin_vel_b": [0.3, -0.3, 0.0]}, 0.7),
     Case("feet_air_time", "falling is not moving", {"base_lin_vel_b": [0.0, 0.0, -2.0]}, 0.7),
     Case(
-        "feet_air_time",
-        "another speed threshold",
-        {"base_lin_vel_b": [0.3, -0.3, 0.0]},
-        0.0,
-        {"speed_threshold": 0.4},
+        "feet_air_time", "another speed threshold", {"base_lin_vel_b": [0.3, -0.3, 0.0]}, 0.0, {"speed_threshold": 0.4}
     ),
     Case(
         "feet_air_time_touchdown",
@@ -384,10 +375,7 @@ CASES = [
     Case("foot_slip_literal", "two sliding feet bear force", SLIDING, 5.02493781),  # sqrt(5^2 + 0.5^2)
     Case("joint_deviation_literal", "all joints 0.1 off", {"joint_pos": TENTH_OFF}, 1.2),
     Case(
-        "joint_deviation_literal",
-        "left and right cancel",
-        {"joint_pos": with_joints(FR_thigh=1.8, FL_thigh=-0.2)},
-        0.0,
+        "joint_deviation_literal", "left and right cancel", {"joint_pos": with_joints(FR_thigh=1.8, FL_thigh=-0.2)}, 0.0
     ),
     Case(
         "joint_position_limit_literal",

@@ -276,10 +276,7 @@ def vendor_inertials(leg: str) -> dict[str, Inertial]:
     calf_six = (1.088793059e-3, 1.100428748e-3, 2.4787446e-5, -2.55679e-7, 7.117814e-6, 2.077264e-6)
     return {
         "hip": combine(
-            [
-                inertial(0.591, (-0.005657 * f, -0.008752 * s, -0.000102), hip_six),
-                rotor(axis=1).at(0, -0.00015 * s, 0),
-            ]
+            [inertial(0.591, (-0.005657 * f, -0.008752 * s, -0.000102), hip_six), rotor(axis=1).at(0, -0.00015 * s, 0)]
         ),
         "thigh": combine(
             [inertial(0.92, (-0.003342, -0.018054 * s, -0.033451), thigh_six), rotor(axis=1).at(0, -0.03235 * s, 0)]

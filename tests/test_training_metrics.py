@@ -98,7 +98,6 @@ def test_a_reset_forgets_the_stride_of_its_rows() -> None:
 def test_a_slipping_foot_and_a_blow_are_seen(make_core: Callable[..., Go1Core], tmp_path: Path) -> None:
     s: Snapshot = random_snapshot(3)
     log = GaitLog(3, DT, torch.device("cpu"))
-    assert s.foot_peak_force is not None
     log.add(dataclasses.replace(s, foot_vel_w=torch.ones(3, 4, 3), foot_peak_force=s.foot_peak_force * 1000.0))
     figures = log.drain()
     assert figures["contact/slip_share"] == 1.0

@@ -90,7 +90,6 @@ class Recorder:
         for name in SNAPSHOT_COLUMNS:
             columns[name][row] = getattr(s, name).numpy()
         columns["foot_slip_speed"][row] = slip_speed(s).numpy()
-        assert s.base_pos_w is not None
         columns["base_height"][row] = (s.base_pos_w[:, 2] - self._core.ground_height(s.base_pos_w[:, :2])).numpy()
         self._counts[row] = alive.numpy()
         self._row += 1

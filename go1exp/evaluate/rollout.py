@@ -207,7 +207,6 @@ def _agent(task: TaskConfig, policy: Policy | None, controller: Callable[[], Con
 def planar_velocity(core: Go1Core) -> torch.Tensor:
     """Return the velocity of the trunk in its own frame (N, 3), float64: x and y in m/s, yaw rate in rad/s."""
     s = core.snapshot()
-    assert s.base_lin_vel_b is not None
     return torch.cat([s.base_lin_vel_b[:, :2], s.base_ang_vel_b[:, 2:]], dim=1).double()
 
 

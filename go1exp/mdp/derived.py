@@ -29,7 +29,6 @@ DIAGONAL_SIGNS = (1.0, -1.0, -1.0, 1.0)
 
 def is_moving(s: Snapshot, speed_threshold: float) -> Tensor:
     """(N,) bool: non-zero command, or faster than ``speed_threshold`` m/s without one (Isaac Lab, Spot task)."""
-    assert s.base_lin_vel_b is not None
     return (s.command.norm(dim=-1) > 0) | (s.base_lin_vel_b[:, :2].norm(dim=-1) > speed_threshold)
 
 
@@ -40,7 +39,6 @@ def joint_deviation(s: Snapshot) -> Tensor:
 
 def foot_speed_xy(s: Snapshot) -> Tensor:
     """(N, 4) horizontal speed of the feet, m/s."""
-    assert s.foot_vel_w is not None
     return s.foot_vel_w[..., :2].norm(dim=-1)
 
 
@@ -49,8 +47,6 @@ def slip_speed(s: Snapshot) -> Tensor:
 
     A foot that stands still rolls with its leg, so that its centre moves: at 3 m/s by 0.3 m/s.
     """
-    assert s.foot_vel_w is not None
-    assert s.base_quat_w is not None
     hip, turning = s.joint_pos.unflatten(-1, (4, 3))[..., 0], s.joint_vel.unflatten(-1, (4, 3))
     pitching = turning[..., 1] + turning[..., 2]  # thigh and calf turn about the axis that the hip has tilted
     of_leg = torch.stack([turning[..., 0], torch.cos(hip) * pitching, torch.sin(hip) * pitching], dim=-1)

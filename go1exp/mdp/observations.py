@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 @observation("base_linear_velocity", size=3, mirror=POLAR)
 def base_linear_velocity(s: Snapshot) -> Tensor:
     """Velocity of the trunk origin in the trunk frame, (N, 3) m/s. On the robot it comes from an estimator."""
-    assert s.base_lin_vel_b is not None
     return s.base_lin_vel_b
 
 
@@ -96,7 +95,6 @@ def foot_force(s: Snapshot, *, scale: Positive = 1.0) -> Tensor:
 @observation("foot_height", size=4, mirror=LEGS)
 def foot_height(s: Snapshot, *, scale: Positive = 1.0) -> Tensor:
     """Heights of the feet's centres over the ground below them, (N, 4) m, times ``scale``."""
-    assert s.foot_height is not None
     return s.foot_height * scale
 
 

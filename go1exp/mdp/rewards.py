@@ -70,7 +70,6 @@ def linear_velocity_error(s: Snapshot, *, scale: Positive = 1.0, ramp: NonNegati
     ``ramp``, s/m, raises the reward of fast commands: times 1 + ramp max(|v*_xy| - 1 m/s, 0), as in Isaac Lab's
     Spot task.
     """
-    assert s.base_lin_vel_b is not None
     wanted = s.command[:, :2]
     kernel = torch.exp(-(wanted - s.base_lin_vel_b[:, :2]).norm(dim=-1) / scale)
     return kernel * (1.0 + ramp * (wanted.norm(dim=-1) - 1.0).clamp(min=0.0))
@@ -114,7 +113,6 @@ def foot_clock(s: Snapshot, *, rate: Positive = 2.5, height: Positive = 0.06) ->
     0 on average for standing feet, so that a fall costs no more than the trot that is missed; as steep there as next to
     1; 0 while no motion is commanded. Not in Table III; after Siekmann et al., arXiv 2011.01387, heights for forces.
     """
-    assert s.foot_height is not None
     lift = torch.sin(clock_angle(s, rate)).unsqueeze(-1) * constant_like(DIAGONAL_SIGNS, s.foot_height)
     wanted = lift.clamp(min=0.0).square()
     sole = (s.foot_height - robot.FOOT_RADIUS).clamp(min=0.0) / height
@@ -156,7 +154,6 @@ def foot_clearance(
     z is the height of the foot's centre over the ground, u its horizontal speed; h in m, ``scale`` in m2,
     ``speed_scale`` k in s/m. Printed without magnitude or speed: exp(-sum (z_i - 0.08)); form of Isaac Lab's Spot task.
     """
-    assert s.foot_height is not None
     error = (s.foot_height - target_height).square() * torch.tanh(speed_scale * foot_speed_xy(s))
     return torch.exp(-error.sum(-1) / scale)
 
@@ -183,7 +180,6 @@ def base_motion(s: Snapshot, *, heave_weight: Fraction = 0.8) -> Tensor:
 
     Printed as |w_x + w_y|, which a roll and an equal pitch cancel; form of Isaac Lab's Spot task.
     """
-    assert s.base_lin_vel_b is not None
     tilt_rate = s.base_ang_vel_b[:, :2].abs().sum(-1)
     return heave_weight * s.base_lin_vel_b[:, 2].square() + (1.0 - heave_weight) * tilt_rate
 
@@ -219,7 +215,6 @@ def foot_peak_force(s: Snapshot) -> Tensor:
     A footfall's peak lasts a few milliseconds; the last physics step shows one in several. A force counts for
     ``LARGEST_PRICED_FORCE`` at most.
     """
-    assert s.foot_peak_force is not None
     return s.foot_peak_force.clamp(max=LARGEST_PRICED_FORCE).square().sum(-1)
 
 
@@ -229,7 +224,6 @@ def touchdown_speed(s: Snapshot, *, free: NonNegative = 0.0) -> Tensor:
 
     Counted in the step of the touchdown: weight x policy period for each. Not in Table III.
     """
-    assert s.foot_touchdown_speed is not None
     return ((s.foot_touchdown_speed - free).clamp(min=0.0).square() * s.foot_touchdown).sum(-1)
 
 
@@ -242,7 +236,6 @@ def joint_torque(s: Snapshot) -> Tensor:
 @reward("joint_acceleration")
 def joint_acceleration(s: Snapshot) -> Tensor:
     """Jerkiness, |qdd| over the last physics substep, rad/s2. Table III."""
-    assert s.joint_acc is not None
     return s.joint_acc.norm(dim=-1)
 
 
@@ -286,14 +279,12 @@ def joint_velocity_limit(s: Snapshot, *, limit: tuple[Positive, Positive, Positi
 @reward("thigh_contact")
 def thigh_contact(s: Snapshot) -> Tensor:
     """Thighs that touch the ground, 0 to 4. Table III."""
-    assert s.thigh_contact is not None
     return s.thigh_contact.sum(-1).to(s.joint_pos.dtype)
 
 
 @reward("calf_contact")
 def calf_contact(s: Snapshot) -> Tensor:
     """Calves that touch the ground, 0 to 4; the foot does not count. Table III."""
-    assert s.calf_contact is not None
     return s.calf_contact.sum(-1).to(s.joint_pos.dtype)
 
 
@@ -303,7 +294,6 @@ def trunk_contact(s: Snapshot) -> Tensor:
 
     Where this ends the episode (``termination=fall``) it is the penalty of a fall, once: weight x policy period.
     """
-    assert s.trunk_contact is not None
     return s.trunk_contact.to(s.joint_pos.dtype)
 
 

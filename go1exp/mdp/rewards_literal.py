@@ -29,7 +29,6 @@ def feet_air_time_literal(s: Snapshot, *, threshold: NonNegative = 0.175) -> Ten
 @reward("foot_clearance_literal")
 def foot_clearance_literal(s: Snapshot, *, target_height: NonNegative = 0.08) -> Tensor:
     """As printed: exp(-sum_i (z_i - h)), z over the ground in m; largest with all feet on the ground."""
-    assert s.foot_height is not None
     return torch.exp(-(s.foot_height - target_height).sum(-1))
 
 

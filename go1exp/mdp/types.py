@@ -32,7 +32,7 @@ class TermSetup:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """One policy step of N robots, float32 unless stated; what a source cannot measure is None.
+    """One policy step of N robots, float32 unless stated.
 
     Joints and legs in the order of ``robot.py``; ``_b`` is the trunk frame, ``_w`` the world frame. Joint and base
     state are current. Contact forces and foot kinematics are MuJoCo sensors and describe the last physics substep,
@@ -40,11 +40,11 @@ class Snapshot:
     cover every substep of the step.
     """
 
-    base_pos_w: Tensor | None
+    base_pos_w: Tensor
     """(N, 3) trunk origin, m."""
     base_quat_w: Tensor
     """(N, 4) w-x-y-z, trunk to world."""
-    base_lin_vel_b: Tensor | None
+    base_lin_vel_b: Tensor
     """(N, 3) velocity of the trunk origin, m/s."""
     base_ang_vel_b: Tensor
     """(N, 3) rad/s."""
@@ -54,7 +54,7 @@ class Snapshot:
     """(N, 12) rad."""
     joint_vel: Tensor
     """(N, 12) rad/s."""
-    joint_acc: Tensor | None
+    joint_acc: Tensor
     """(N, 12) velocity change over the last physics substep, rad/s2."""
     joint_torque: Tensor
     """(N, 12) torque applied in the last physics substep, N m."""
@@ -66,9 +66,9 @@ class Snapshot:
     """(N, 12) that of the step before (zero after a reset)."""
     command: Tensor
     """(N, 3) commanded velocity: x, y in m/s, yaw rate in rad/s, body frame."""
-    foot_height: Tensor | None
+    foot_height: Tensor
     """(N, 4) height of the centre of each foot sphere over the ground below it, m (0.023 when standing on it)."""
-    foot_vel_w: Tensor | None
+    foot_vel_w: Tensor
     """(N, 4, 3) velocity of the foot centres, m/s."""
     foot_force: Tensor
     """(N, 4) magnitude of the ground's force on each foot, N."""
@@ -84,16 +84,16 @@ class Snapshot:
     """(N, 4) duration of the last completed stance phase, s."""
     foot_touchdown: Tensor
     """(N, 4) bool, the foot touched down during this policy step."""
-    foot_peak_force: Tensor | None
+    foot_peak_force: Tensor
     """(N, 4) largest magnitude of the ground's force on each foot over the substeps of this policy step, N."""
-    foot_touchdown_speed: Tensor | None
+    foot_touchdown_speed: Tensor
     """(N, 4) speed of the foot's last touchdown, kept until the next one, 0 before the first, m/s: the downward
     component (world) of the velocity of the foot's centre just before the contact, 0 if it moved upward."""
-    thigh_contact: Tensor | None
+    thigh_contact: Tensor
     """(N, 4) bool, the thigh touched the ground during this policy step."""
-    calf_contact: Tensor | None
+    calf_contact: Tensor
     """(N, 4) bool, the calf (without the foot) touched the ground during this policy step."""
-    trunk_contact: Tensor | None
+    trunk_contact: Tensor
     """(N,) bool, trunk, head or a hip touched the ground during this policy step."""
     episode_time: Tensor
     """(N,) time since the last reset, s."""

@@ -86,7 +86,9 @@ def changeable(parts: Mapping[str, Any]) -> list[str]:
     command = parts["command"].parameters if parts.get("command") else {}
     shares = [path for path in SHARES if command.get(path.removeprefix("command."))]
     contact = [CONTACT_TIME] if parts.get("contact") else []
-    return [*paths, *([DELAY] if _is_delay(parts) else []), *contact, *shares]
+    actuator = parts.get("actuator")
+    delay = [DELAY] if actuator is not None and actuator.entry.name == "delay" else []
+    return [*paths, *delay, *contact, *shares]
 
 
 def _numbers(term: Term) -> list[str]:
@@ -94,11 +96,6 @@ def _numbers(term: Term) -> list[str]:
     fixed = term.entry.traits.get("fixed", ())
     values = term.parameters.items()
     return [k for k, v in values if isinstance(v, int | float) and not isinstance(v, bool) and k not in fixed]
-
-
-def _is_delay(parts: Mapping[str, Any]) -> bool:
-    actuator = parts.get("actuator")
-    return actuator is not None and actuator.entry.name == "delay"
 
 
 def _target_problems(path: str, ramp: Ramp, parts: Mapping[str, Any]) -> list[str]:
@@ -125,8 +122,12 @@ def _target_problems(path: str, ramp: Ramp, parts: Mapping[str, Any]) -> list[st
 def _value_problems(path: str, target: str, value: Value, parts: Mapping[str, Any]) -> list[str]:
     """Return what is wrong with one value of a setting, each beginning with ``path``."""
     if target == CONTACT_TIME:
-        adapter = TypeAdapter(ContactConfig)
-        return _problems_of(adapter, {"time_constant": value, "cone": "pyramidal", "impratio": 1.0}, path)
+        settings = {"time_constant": value, "cone": "pyramidal", "impratio": 1.0}
+        try:
+            TypeAdapter(ContactConfig).validate_json(as_json(settings))
+        except ValidationError as error:
+            return _renamed(explain(error, "", settings), "time_constant", path)
+        return []
     if target == DELAY:
         term = parts["actuator"]
         of_delay = _renamed(term.entry.check({**term.parameters, "command": value}, "")[1], "command", path)
@@ -142,14 +143,6 @@ def _value_problems(path: str, target: str, value: Value, parts: Mapping[str, An
     return _renamed(term.entry.check({**term.parameters, name: value}, "")[1], name, path)
 
 
-def _problems_of(adapter: TypeAdapter[Any], settings: Mapping[str, Any], path: str) -> list[str]:
-    try:
-        adapter.validate_json(as_json(settings))
-    except ValidationError as error:
-        return _renamed(explain(error, "", settings), "time_constant", path)
-    return []
-
-
 def _renamed(problems: list[str], name: str, path: str) -> list[str]:
     """Put the key path of a ramp in the place of the parameter's name at the beginning of each message."""
     return [f"{path}{problem.removeprefix(name)}" for problem in problems]
@@ -157,12 +150,9 @@ def _renamed(problems: list[str], name: str, path: str) -> list[str]:
 
 def _contact_problems(path: str, parts: Mapping[str, Any]) -> list[str]:
     """Refuse a ramp of the contact together with terms that set the contact of each robot."""
-    others = [f"rand.{t.key}" for t in parts.get("rand") or () if _sets_contact(t.entry.traits.get("fields"))]
-    others += [f"effect.{t.key}" for t in parts.get("effect") or () if _sets_contact(t.entry.target.fields)]
+    fields = {f"rand.{t.key}": t.entry.traits.get("fields", ()) for t in parts.get("rand") or ()}
+    fields |= {f"effect.{t.key}": t.entry.target.fields for t in parts.get("effect") or ()}
+    others = [name for name, written in fields.items() if FEET_CONTACT_FIELD in written]
     return [
         f"{path}.set = {CONTACT_TIME!r}: {other} sets the contact of each robot; use one of the two" for other in others
     ]
-
-
-def _sets_contact(fields: Any) -> bool:
-    return FEET_CONTACT_FIELD in (fields or ())

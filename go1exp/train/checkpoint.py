@@ -19,7 +19,6 @@ import torch
 
 from go1exp.base.errors import Expected
 from go1exp.base.files import opened
-from go1exp.sim.env.sb3_env import Go1VecEnv
 from go1exp.train.ppo import AdaptivePPO
 
 FORMAT = 1
@@ -119,7 +118,7 @@ def restore(ppo: AdaptivePPO, state: dict[str, Any]) -> None:
     Raises:
         DamagedCheckpoint: if a part of this version's environment is missing in it; the learner is as it was.
     """
-    core = _core(ppo)
+    core = ppo.core
     try:
         core.load_state_dict(ppo.group.part(state["env"], core.num_envs))
     except KeyError as missing:
@@ -148,18 +147,12 @@ def restore(ppo: AdaptivePPO, state: dict[str, Any]) -> None:
     random.setstate((version, tuple(state_words), gauss))
 
 
-def _core(ppo: AdaptivePPO) -> Any:
-    env = ppo.get_env()
-    assert isinstance(env, Go1VecEnv)
-    return env.core
-
-
 def _state(ppo: AdaptivePPO) -> dict[str, Any]:
     kind, keys, position, has_gauss, cached = np.random.get_state(legacy=True)  # noqa: NPY002 (SB3 draws from it)
     version, state_words, gauss = random.getstate()
     assert ppo.ep_info_buffer is not None
     assert isinstance(ppo._last_obs, np.ndarray)
-    core, starts = _core(ppo), np.asarray(ppo._last_episode_starts)
+    core, starts = ppo.core, np.asarray(ppo._last_episode_starts)
     local = (core.state_dict(), torch.from_numpy(ppo._last_obs.copy()), torch.from_numpy(starts.copy()))
     schedule = ppo.schedule.state_dict()
     return {

@@ -18,10 +18,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
 from go1exp import robot
-from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.engine import captured
 from go1exp.sim.env.faults import NumericalFault
-from go1exp.sim.env.sb3_env import Go1VecEnv
 from go1exp.sim.task import PPOConfig
 from go1exp.train.device_update import DeviceRolloutBuffer, DeviceUpdate
 from go1exp.train.group import Group, SharedNoise
@@ -52,7 +50,7 @@ class DevicePPO(AdaptivePPO):
 
     def _collect_step(self) -> None:
         """Act on the observation, step, keep both; in place, so that it can be replayed as a graph."""
-        core, policy = self._core(), self.policy
+        core, policy = self.core, self.policy
         with torch.no_grad():
             actions, values, log_probs = policy(self._observation)
             result = core.step_by_call(actions)
@@ -74,19 +72,14 @@ class DevicePPO(AdaptivePPO):
             self._observation.copy_(result.observation)
             self._starts.copy_(ended)
 
-    def _core(self) -> Go1Core:
-        env = self.get_env()
-        assert isinstance(env, Go1VecEnv)
-        return env.core
-
     def _stepper(self) -> Callable[[], None]:
         """Return what makes one step of a rollout: the graph of it, recorded at the first call."""
-        if not self._core().captures:
+        if not self.core.captures:
             return self._collect_step
         if self._replay is None:
             before = self._observation.clone(), self._starts.clone(), torch.cuda.get_rng_state(self.device)
             self.group.meet()
-            self._replay, _ = captured(self._core(), self._collect_step)
+            self._replay, _ = captured(self.core, self._collect_step)
             self.group.meet()
             self._observation.copy_(before[0])
             self._starts.copy_(before[1])
@@ -115,7 +108,7 @@ class DevicePPO(AdaptivePPO):
         buffer.full = buffer.pos == buffer.buffer_size
         with torch.no_grad():
             buffer.estimate(self.policy.predict_values(self._observation).squeeze(1), self._starts)
-        self._core().check_so_far()
+        self.core.check_so_far()
         assert self.ep_info_buffer is not None
         self.ep_info_buffer.extend(buffer.episodes(self._stats_window_size))
         self._last_obs, self._last_episode_starts = self._observation.cpu().numpy(), self._starts.cpu().numpy()
@@ -134,7 +127,7 @@ class DevicePPO(AdaptivePPO):
         """
         self.policy.set_training_mode(True)
         if self._update is None:
-            self._update = DeviceUpdate(self, self.rollout_buffer, captures=self._core().captures)
+            self._update = DeviceUpdate(self, self.rollout_buffer, captures=self.core.captures)
         figures = self._update(linear_rate(self.config, self.iteration))
         self._n_updates += self.n_epochs
         self._kl = figures.pop("kl")

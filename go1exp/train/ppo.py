@@ -25,6 +25,7 @@ from stable_baselines3.common.utils import explained_variance, safe_mean
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 
+from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.faults import NumericalFault
 from go1exp.sim.env.sb3_env import Go1VecEnv
 from go1exp.sim.task import PPOConfig
@@ -234,6 +235,13 @@ class AdaptivePPO(PPO):
             seed=seed,
             device=device,
         )
+
+    @property
+    def core(self) -> Go1Core:
+        """The environments of a robot."""
+        env = self.get_env()
+        assert isinstance(env, Go1VecEnv)
+        return env.core
 
     def _setup_model(self) -> None:
         super()._setup_model()

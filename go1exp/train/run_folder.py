@@ -139,11 +139,10 @@ def _meta(container: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _git(*arguments: str) -> str | None:
+def _git(*arguments: str, folder: Path | None = None) -> str | None:
+    command = ["git", "-C", str(folder or data_root()), *arguments]
     try:
-        done = subprocess.run(
-            ["git", "-C", str(data_root()), *arguments], capture_output=True, text=True, timeout=10, check=True
-        )
+        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip()
@@ -303,14 +302,7 @@ def _kept_file(run: Path, plugin: Plugin) -> dict[str, Any]:
 def _kept_package(plugin: Plugin) -> dict[str, Any]:
     """Say which package it is: its version, and its commit if it lies in a git repository."""
     spec = importlib.util.find_spec(plugin.module)
-    commit = None
-    if spec is not None and spec.origin:
-        try:
-            command = ["git", "-C", str(Path(spec.origin).parent), "rev-parse", "HEAD"]
-            done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
-            commit = done.stdout.strip()
-        except (OSError, subprocess.SubprocessError):
-            pass
+    commit = _git("rev-parse", "HEAD", folder=Path(spec.origin).parent) if spec is not None and spec.origin else None
     return {"name": plugin.name, "version": _version(plugin.module), "commit": commit}
 
 

@@ -55,8 +55,10 @@ def locked(run: Path) -> Iterator[None]:
         lock = _acquired(run)
     except OSError as error:
         raise OSError(error.errno, f"run folder cannot be written: {error.strerror}", str(run)) from error
+    since = f"{datetime.now():%Y-%m-%d %H:%M:%S}"
+    holder = {"host": socket.gethostname(), "pid": os.getpid(), "since": since}
     with lock:
-        (run / HOLDER).write_text(json.dumps(_holder()) + "\n")
+        (run / HOLDER).write_text(json.dumps(holder) + "\n")
         remove_partial(run)
         remove_partial(run / "checkpoints")
         try:
@@ -98,10 +100,6 @@ def _acquired(run: Path) -> BaseFileLock:
     except Timeout:
         raise RunInUse(f"{run}: in use by {_described(run)}; wait for it, stop it, or use another folder") from None
     return lock
-
-
-def _holder() -> dict[str, object]:
-    return {"host": socket.gethostname(), "pid": os.getpid(), "since": f"{datetime.now():%Y-%m-%d %H:%M:%S}"}
 
 
 def _described(run: Path) -> str:

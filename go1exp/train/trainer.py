@@ -258,13 +258,11 @@ class _Closing:
 
     def __call__(self, ppo: AdaptivePPO) -> None:
         """Close the iteration that ``ppo`` has just completed."""
-        env, steps = ppo.get_env(), self.config.ppo.steps
-        assert isinstance(env, Go1VecEnv)
-        now = time.monotonic()
+        steps, now = self.config.ppo.steps, time.monotonic()
         self.logger.record("iteration", ppo.iteration)
         self.logger.record("time/steps_per_s", self.config.ppo.num_envs * steps / (now - self._clock))
         self._clock = now
-        for key, value in ppo.group.metrics(env.core.drain_metrics(steps)).items():
+        for key, value in ppo.group.metrics(ppo.core.drain_metrics(steps)).items():
             self.logger.record(key, value)
         for key, value in ppo.schedule.metrics().items():
             self.logger.record(key, value)

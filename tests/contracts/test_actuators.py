@@ -1,4 +1,4 @@
-"""What every actuator promises, and the law of PD."""
+"""What every actuator promises beyond ``check_actuator`` (``test_members.py``), and the law of PD."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.config.schema.registry import members
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.actuator.motors import Actuator
-from tests.rounding import alone_and_in_a_batch
 
 NEEDS: dict[str, Callable[[Path], dict[str, Any]]] = {
     "delay": lambda net: {"drive": {"term": "pd"}},
@@ -70,22 +69,6 @@ def test_it_gives_no_torque_without_error_at_rest(build: Callable[..., Actuator]
     q = torch.as_tensor(robot.NOMINAL_STANCE).repeat(3, 1)
     for _ in range(10):
         assert not actuator.torque(q, q, torch.zeros_like(q)).any()
-
-
-def test_it_drives_a_robot_the_same_alone_and_in_a_batch(
-    name: str, build: Callable[..., Actuator], net_file: Path
-) -> None:
-    atol = alone_and_in_a_batch(net_file, largest_input=20.0) if "net" in name else 0.0  # others have no matrix product
-    batch, alone = build(5), [build(1, first=i) for i in range(5)]
-    for k in range(30):
-        if k == 15:
-            batch.reset(torch.tensor([False, True, False, True, False]))
-            for i in range(5):  # time passes for all of them
-                alone[i].reset(torch.tensor([i in (1, 3)]))
-        together = batch.torque(*moment(5, k))
-        for i in range(5):
-            single = alone[i].torque(*(x[i : i + 1] for x in moment(5, k)))
-            torch.testing.assert_close(together[i : i + 1], single, rtol=0.0, atol=atol)
 
 
 def test_it_begins_an_episode_as_if_it_were_the_first(build: Callable[..., Actuator]) -> None:

@@ -39,7 +39,6 @@ from go1exp.train.policy import load_network
 def readings(core: Go1Core) -> dict[str, Tensor]:
     """Return the present readings of the robots' sensors and computers, (N, size) by name, without noise."""
     s = core.snapshot()
-    assert s.base_lin_vel_b is not None
     measured = Measured(s.joint_pos, s.joint_vel, gyro=s.base_ang_vel_b, quat=s.base_quat_w)
     effects = core.plant.effects
     if effects.senses:

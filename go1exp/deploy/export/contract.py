@@ -116,7 +116,6 @@ def drive(
         result = core.step(torch.cat([action for _, action in out]))
         fall = np.where(result.terminated.numpy() & np.isinf(fall), (step + 1) * period, fall)
         s = core.snapshot()
-        assert s.base_lin_vel_b is not None
         velocity = torch.cat([s.base_lin_vel_b[:, :2], s.base_ang_vel_b[:, 2:]], dim=1)
         if step * period >= SETTLE:
             errors.append((velocity - commands).numpy())

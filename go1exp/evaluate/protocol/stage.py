@@ -168,7 +168,7 @@ class Session:
         self._observation = self.core.reset()
         if self._kicker:
             self._kicker.time = 0.0
-        self._start = self.core.snapshot().base_pos_w[:, :2].numpy().copy()  # type: ignore[index]
+        self._start = self.core.snapshot().base_pos_w[:, :2].numpy().copy()
 
     def use(self, impulses: Impulses) -> None:
         """Apply other kicks from now on."""
@@ -250,7 +250,6 @@ class Session:
 
     def _keep(self, kept: dict[str, Any], row: int) -> None:
         s = self.core.snapshot()
-        assert s.base_pos_w is not None
         kept["velocity"][row] = planar_velocity(self.core).numpy()
         below = self.core.ground_height(s.base_pos_w[:, :2])
         kept["height"][row] = (s.base_pos_w[:, 2] - below).numpy()

@@ -311,7 +311,6 @@ class Session:
 
     def _remember(self) -> None:
         s, core = self.core.snapshot(), self.core
-        assert s.base_pos_w is not None
         below = core.ground_height(s.base_pos_w[:, :2])
         reward = np.array([float(v[0]) for v in core.reward_terms().values()]) / self.dt
         row: dict[str, Vector] = {

@@ -62,8 +62,6 @@ class GaitLog(Memory):
 
     def add(self, s: Snapshot) -> None:
         """Take in a policy step, before ended episodes begin anew."""
-        assert s.foot_peak_force is not None
-        assert s.foot_touchdown_speed is not None
         moving = (s.command != 0.0).any(-1, keepdim=True)
         airborne = torch.where(s.foot_touchdown, s.foot_last_air_time, s.foot_air_time)
         swing = torch.maximum(self.swing, airborne)
@@ -171,8 +169,6 @@ class TaskLog(Memory):
             ends: whether an episode ended by a fall, at its time limit, or cut short for another reason, (N,) bool.
             episode: return and length in steps so far, (N,) each.
         """
-        assert s.base_lin_vel_b is not None
-        assert s.base_ang_vel_b is not None
         command = s.command
         velocity = torch.cat([s.base_lin_vel_b[:, :2], s.base_ang_vel_b[:, 2:]], -1)
         errors = (velocity - command).square()

@@ -204,7 +204,6 @@ class StepTerms:
 
     def cut_short(self, left_map: Tensor, s: Snapshot) -> Tensor:
         """(N,) bool, whose episode ends without a failure of the robot; ``left_map`` (N,) bool."""
-        assert s.foot_peak_force is not None
         self.left_map.copy_(left_map)
         if not self.distrusts:
             return self.left_map

@@ -21,7 +21,7 @@ from go1exp.base import signals
 from go1exp.config.schema.registry import ConfigError, CountOrZero, nearest
 from go1exp.config.schema.settings import parse, settings
 from go1exp.train.sweep import ray_cluster, slurm
-from go1exp.train.sweep.command import Command, Ended, Launcher, Running, Task, Watch
+from go1exp.train.sweep.command import Ended, Launcher, Running, Task, Watch
 
 
 @settings
@@ -60,6 +60,9 @@ class Basic:
 
     remote = False
 
+    def __init__(self, settings: BasicSettings) -> None:
+        """There is nothing to set."""
+
     def check(self) -> None:
         """Nothing can be missing."""
 
@@ -72,18 +75,13 @@ class Basic:
                 watch.changed()
 
 
-class Local:
+class Local(Basic):
     """Several jobs at once. Cores are shared out: a thread of one never waits for a core of another."""
-
-    remote = False
 
     def __init__(self, settings: JoblibSettings) -> None:
         cores = sorted(os.sched_getaffinity(0))
         at_once = len(cores) if settings.n_jobs < 0 else settings.n_jobs
         self.shares = shares(cores, at_once, settings.threads)
-
-    def check(self) -> None:
-        """Nothing can be missing."""
 
     def launch(self, folder: Path, tasks: Sequence[Task], watch: Watch) -> None:
         """Run the tasks (see ``Launcher``)."""
@@ -98,7 +96,8 @@ class Local:
             try:
                 if stopping:
                     return None
-                running[task.run_folder] = Running(_with_cores(task.command, share))
+                variables = {**task.command.variables, "OMP_NUM_THREADS": str(len(share))}
+                running[task.run_folder] = Running(replace(task.command, cores=share, variables=variables))
                 return running[task.run_folder].wait()
             finally:
                 running.pop(task.run_folder, None)
@@ -165,17 +164,13 @@ def shares(cores: Sequence[int], at_once: int, threads: int = 0) -> list[tuple[i
     return [tuple(sorted(ring[(k * width) % len(cores) :][:width])) for k in range(at_once)]
 
 
-def _with_cores(command: Command, share: tuple[int, ...]) -> Command:
-    return replace(command, cores=share, variables={**command.variables, "OMP_NUM_THREADS": str(len(share))})
-
-
-LAUNCHERS: dict[str, Any] = {
-    "basic": BasicSettings,
-    "joblib": JoblibSettings,
-    "slurm": slurm.SlurmSettings,
-    "ray": ray_cluster.RaySettings,
+LAUNCHERS: dict[str, tuple[Any, Any]] = {
+    "basic": (BasicSettings, Basic),
+    "joblib": (JoblibSettings, Local),
+    "slurm": (slurm.SlurmSettings, slurm.Slurm),
+    "ray": (ray_cluster.RaySettings, ray_cluster.Ray),
 }
-"""Name -> class of its settings."""
+"""Name -> class of its settings, and what is built with them."""
 
 HYDRAS_BASIC = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
 """What ``hydra/launcher=basic``, Hydra's default, is called in a composed configuration."""
@@ -196,12 +191,12 @@ def chosen(container: Mapping[str, Any]) -> Any:
         hint = f"did you mean {close[0]!r}?" if close else f"there are: {', '.join(LAUNCHERS)}"
         raise ConfigError([f"hydra/launcher: {given!r} is no launcher of sweeps; {hint}"])
     try:
-        return parse(LAUNCHERS[name], container)
+        return parse(LAUNCHERS[name][0], container)
     except ConfigError as error:
         raise ConfigError([f"hydra.launcher.{problem}" for problem in error.problems]) from None
 
 
 def built(settings: Any) -> Launcher:
-    """Return the launcher with these settings; what it runs on is imported now."""
-    kinds: dict[str, Any] = {"joblib": Local, "slurm": slurm.Slurm, "ray": ray_cluster.Ray}
-    return Basic() if settings.name == "basic" else kinds[settings.name](settings)
+    """Return the launcher with these settings."""
+    launcher: Launcher = LAUNCHERS[settings.name][1](settings)
+    return launcher
