@@ -53,7 +53,7 @@ API = {
 
 def write(folder: Path) -> None:
     """Write all reference pages into ``folder``; files that do not change keep their time."""
-    pages = {"index.md": _index(), "choices.md": _choices(), "python.md": _python()}
+    pages = {"index.md": _index(), "choices.md": _choices(), "python.md": _python(), "statuses.md": _statuses()}
     pages |= {f"{group}.md": _group(group, title) for group, title in GROUPS.items()}
     pages |= {f"verb-{verb}.md": text for verb, text in _verbs().items()}
     folder.mkdir(exist_ok=True)
@@ -78,7 +78,7 @@ def _index() -> str:
             "",
             *_toctree("Verbs", verbs.splitlines()),
             *_toctree("Terms", list(GROUPS)),
-            *_toctree("Files and Python", ["choices", "python"]),
+            *_toctree("Files and Python", ["choices", "statuses", "python"]),
         ]
     )
 
@@ -225,6 +225,23 @@ def _choices() -> str:
         if rest:
             lines += [f"## {group}", "", *_table(("choice", "what it is"), _rows(rest))]
     return "\n".join(lines)
+
+
+def _statuses() -> str:
+    from go1exp.base.errors import STATUSES
+
+    rows = [(str(status), verb, f"{meaning[0].upper()}{meaning[1:]}") for status, (verb, meaning) in STATUSES.items()]
+    return "\n".join(
+        [
+            "# Exit statuses",
+            "",
+            "Every verb ends an error with one line on standard error, or one for each problem of its settings.",
+            "A fault of go1exp itself is one line, too, which names the file with the traceback.",
+            "`HYDRA_FULL_ERROR=1` prints the traceback instead.",
+            "",
+            *_table(("status", "verb", "meaning"), rows),
+        ]
+    )
 
 
 # ---------------------------------------------------------------------- Python

@@ -276,7 +276,7 @@ def test_what_only_the_fit_knows_is_refused_in_words_too(tmp_path: Path) -> None
 )
 def test_a_recording_that_is_not_there_is_named(arguments: str, said: str, tmp_path: Path) -> None:
     done = refuse(tmp_path, *arguments.split())
-    assert (done.returncode, done.stdout, done.stderr) == (1, "", f"{said}\n")
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", f"{said}\n")
 
 
 @pytest.mark.parametrize(
@@ -373,7 +373,7 @@ def test_a_path_by_position_may_hold_anything(tmp_path: Path) -> None:
     folder = tmp_path / "it's [a] {folder}, $x"
     done = refuse(tmp_path, "record", "audit", str(folder), "second one")
     said = f"go1exp record audit: {folder}: no such file\nsecond one: no such file\n"
-    assert (done.returncode, done.stderr) == (1, said)
+    assert (done.returncode, done.stderr) == (2, said)
 
 
 def test_the_value_of_an_option_is_no_setting(tmp_path: Path) -> None:
@@ -537,7 +537,7 @@ GRID = ("grid.x=[0.5]", "grid.y=[]", "grid.yaw=[]", "episodes=2", "duration_s=0.
 def test_eval_prints_a_table_and_writes_the_same_as_json(run: Path, tmp_path: Path) -> None:
     done = cli(tmp_path, "eval", f"run={run}", *GRID, "out=sub/report.json")
     assert done.returncode == 0, done.stderr
-    assert done.stderr == "evaluating ...\n"
+    assert done.stderr.startswith("evaluating ...\n")  # progress, if it takes long
     report: dict[str, Any] = json.loads((tmp_path / "sub/report.json").read_text())
     assert set(report) >= {"policy", "commands", "rmse", "falls", "episodes", "settings"}
     assert report["policy"]["iteration"] == 2

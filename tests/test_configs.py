@@ -22,7 +22,7 @@ import go1exp.logs.importers
 import go1exp.logs.record.motions  # noqa: F401  (registers every importer and excitation)
 from go1exp import cli
 from go1exp.base.paths import data_root
-from go1exp.cli import EVERY, listing
+from go1exp.cli import EVERY, helptext
 from go1exp.cli.app import app_of, begin
 from go1exp.cli.app import parse as parse_settings
 from go1exp.cli.gap import with_logs
@@ -511,7 +511,7 @@ def parse(verb: str, container: dict[str, Any]) -> None:
     if verb == "record_import":
         assert checked.source in registry.members("importer")
     if verb == "list":
-        listing.APP.task(container)
+        helptext.APP.task(container)
     assert problems == []
 
 

@@ -925,11 +925,11 @@ def test_a_signal_while_the_robot_starts_ends_both_at_once(
 def test_what_is_wrong_is_said_in_a_line(bundle: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     from go1exp.deploy.__main__ import main
 
-    assert main([str(tmp_path / "none.zip")]) == 1
+    assert main([str(tmp_path / "none.zip")]) == 2
     assert "No such file" in capfd.readouterr().err
     assert main([bundle, "--command", "fast", "--out", str(tmp_path)]) == 1
     assert capfd.readouterr().err.startswith("go1exp.deploy: command 'fast': must be three numbers")
-    assert main([bundle, "--robot", "dog", "--out", str(tmp_path)]) == 1
+    assert main([bundle, "--robot", "dog", "--out", str(tmp_path)]) == 2
     assert "robot=dog: must be sim, go1, or the port" in capfd.readouterr().err
     with pytest.raises(SystemExit):
         main([bundle, "--rate", "-5"])

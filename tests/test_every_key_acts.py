@@ -42,10 +42,10 @@ from go1exp.cli.evaluate import EvalSettings
 from go1exp.cli.export import ExportCheckSettings, ExportSettings
 from go1exp.cli.fit_actuator import FitActuatorSettings
 from go1exp.cli.gap import GapVerb
-from go1exp.cli.listing import ListSettings
+from go1exp.cli.helptext import ListSettings
 from go1exp.cli.play import PlaySettings
+from go1exp.cli.play_web import BODY
 from go1exp.cli.record import RIG, AuditSettings, ImportSettings, RecordSettings
-from go1exp.cli.simulate import BODY
 from go1exp.cli.subjects import ROBOT_GROUPS
 from go1exp.config import compose as composing
 from go1exp.config.schema import registry
@@ -954,9 +954,10 @@ def recorded(files: Mapping[str, bytes]) -> Trace:
 
 def audit_trace(container: dict[str, Any], walk: Walk) -> Trace:
     """What is said of the recordings, without their names, and where it is written."""
-    from go1exp.cli.record import AUDIT, AUDIT_STATUS
+    from go1exp.base.errors import AUDIT as STATUSES
+    from go1exp.cli.record import AUDIT
 
-    said, files = outcome(AUDIT, container, walk, tuple(AUDIT_STATUS.values()))
+    said, files = outcome(AUDIT, container, walk, tuple(STATUSES.values()))
     yield "findings", [line for line in said.splitlines() if ".parquet" not in line and "written to" not in line]
     yield "files", sorted(files)
 
@@ -1076,7 +1077,7 @@ def deploy_trace(container: dict[str, Any], walk: Walk) -> Trace:
 
 def sim_trace(container: dict[str, Any], walk: Walk) -> Trace:
     """What a client that moves a leg hears, and where the robot truly is, tick by tick."""
-    from go1exp.cli.simulate import APP
+    from go1exp.cli.play_web import SIM as APP
     from go1exp.deploy.sim_robot import alone
 
     seen: list[Any] = []
@@ -1101,7 +1102,7 @@ def sim_trace(container: dict[str, Any], walk: Walk) -> Trace:
 
 
 def list_trace(container: dict[str, Any], walk: Walk) -> Trace:
-    from go1exp.cli.listing import APP
+    from go1exp.cli.helptext import APP
 
     yield "output", outcome(APP, container, walk)[0]
 

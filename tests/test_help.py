@@ -21,6 +21,7 @@ from go1exp.cli.helptext import texts_of
 from go1exp.config.choices import config_folder, groups_in, groups_of
 from go1exp.config.compose import compose
 from go1exp.config.schema.settings import attributes
+from tests.command import refuse
 
 TITLES = [verb.replace("_", " ") for verb in EVERY]
 
@@ -109,7 +110,7 @@ def test_help_before_the_verb_is_the_help_of_the_verb(capsys: pytest.CaptureFixt
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("train --help rewardd", "go1exp train: no group or key 'rewardd'; did you mean 'reward' or "),
+        ("train --help rewardd", "go1exp train: no group or key 'rewardd'; did you mean 'reward'"),
         ("train epsodes --help", "go1exp train: no group or key 'epsodes'; "),
         ("train --help ppo.learning_rat", "did you mean 'ppo.learning_rate' or "),
         ("train --help xyzzy", "go1exp train: no group or key 'xyzzy'; go1exp train --help lists them"),
@@ -117,14 +118,12 @@ def test_help_before_the_verb_is_the_help_of_the_verb(capsys: pytest.CaptureFixt
     ],
 )
 def test_a_word_that_there_is_no_help_for_is_refused_with_what_looks_like_it(
-    line: str, message: str, capsys: pytest.CaptureFixture[str]
+    line: str, message: str, tmp_path: Path
 ) -> None:
-    with mock.patch.object(sys, "argv", ["go1exp", *line.split()]), pytest.raises(SystemExit) as left:
-        main()
-    printed = capsys.readouterr()
-    assert (left.value.code, printed.out) == (2, "")
-    assert message in printed.err
-    assert printed.err.count("\n") == 1
+    done = refuse(tmp_path, *line.split())
+    assert (done.returncode, done.stdout) == (2, "")
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize(

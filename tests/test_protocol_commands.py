@@ -161,7 +161,7 @@ def test_results_that_will_be_replaced_are_named(run: Path, tmp_path: Path, caps
 
 
 def test_the_help_says_what_the_keys_of_a_protocol_are(capsys: pytest.CaptureFixture[str]) -> None:
-    show("eval", "go1exp eval", ["protocol", "protocol=kicks"])
+    show("eval", ["protocol", "protocol=kicks"])
     shown = capsys.readouterr().out
     assert re.search(r"protocol\.kicks\.robots=200 +number of robots in each condition", shown)
     assert re.search(r"protocol\.kicks\.recovery\.height=0\.015\s+largest difference", shown)

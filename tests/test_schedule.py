@@ -270,7 +270,7 @@ def test_only_one_of_two_sets_the_contact(other: str) -> None:
 
 
 def test_help_explains_the_keys_of_a_ramp(capsys: pytest.CaptureFixture[str]) -> None:
-    helptext.show("train", "go1exp train", ["schedule", ramp(f"{WEIGHT}, over: 1")])
+    helptext.show("train", ["schedule", ramp(f"{WEIGHT}, over: 1")])
     shown = capsys.readouterr().out
     assert "schedule.NAME.when" in shown
     assert "schedule.x.set=reward.gait.weight" in shown

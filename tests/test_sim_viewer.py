@@ -265,7 +265,7 @@ def test_of_each_group_the_longest_interval_is_drawn() -> None:
     np.testing.assert_array_equal(longest(t, values, 2500)[0], t)
 
 
-@pytest.mark.slow("go1exp/evaluate/viewer/", "go1exp/deploy/sim_robot/", "go1exp/cli/simulate.py")
+@pytest.mark.slow("go1exp/evaluate/viewer/", "go1exp/deploy/sim_robot/", "go1exp/cli/play_web.py")
 def test_the_robot_lives_in_a_process_of_its_own_and_ends_with_the_page(capfd: pytest.CaptureFixture[str]) -> None:
     groups = {name: CONTAINER[name] for name in GROUPS}
     process = RobotProcess(groups, (0, 0), SimConfig(), ("127.0.0.1", 0), None, SAY)

@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("mujoco.studio")
 
-from go1exp.cli import gap, play, simulate
+from go1exp.cli.app import app_of
 from go1exp.config.compose import compose
 from go1exp.deploy.export.build import build
 from go1exp.evaluate.viewer import requests as ask
@@ -52,11 +52,11 @@ def free_port() -> int:
         return int(sock.getsockname()[1])
 
 
-def page(verb: Any, name: str, overrides: list[str], opened: list[tuple[tuple[str, int], Any]]) -> Any:
+def page(name: str, overrides: list[str], opened: list[tuple[tuple[str, int], Any]]) -> Any:
     """Open a page where ``host`` and ``port`` say, and where they do not; return what the first one shows."""
     port = free_port()
-    verb._task(compose(name, [*overrides, f"host={ELSEWHERE}", f"port={port}"]))
-    verb._task(compose(name, overrides))
+    app_of(name).task(compose(name, [*overrides, f"host={ELSEWHERE}", f"port={port}"]))
+    app_of(name).task(compose(name, overrides))
     (chosen, show), (usual, _) = opened
     assert chosen == (ELSEWHERE, port)
     assert usual[0] == "127.0.0.1"
@@ -66,7 +66,7 @@ def page(verb: Any, name: str, overrides: list[str], opened: list[tuple[tuple[st
 
 def test_gap_view_listens_where_it_is_told_and_shows_the_answer(tmp_path: Path, opened: list[Any]) -> None:
     files.save(answer(), tmp_path / "gap")
-    show = page(gap, "gap", ["stage=view", f"out={tmp_path / 'gap'}"], opened)
+    show = page("gap", ["stage=view", f"out={tmp_path / 'gap'}"], opened)
     assert isinstance(show, ReplayShow)
     assert [piece.title for piece in show.player.story.pieces] == ["a, 2.00 s", "b, 2.00 s"]
 
@@ -74,7 +74,7 @@ def test_gap_view_listens_where_it_is_told_and_shows_the_answer(tmp_path: Path, 
 def test_a_recording_is_shown_where_it_is_told(tmp_path: Path, opened: list[Any]) -> None:
     file = tmp_path / "walk.parquet"
     write(file, recording())
-    show = page(play, "play", [f"log={file}"], opened)
+    show = page("play", [f"log={file}"], opened)
     assert isinstance(show, ReplayShow)
     assert show.player.story.kind == "log"
 
@@ -84,7 +84,7 @@ def test_sim_listens_for_the_page_where_it_is_told(monkeypatch: pytest.MonkeyPat
         return SimpleNamespace(address=address, close=lambda: None, send=lambda wish: None, look=lambda: None)
 
     monkeypatch.setattr(sim_process, "RobotProcess", process)
-    show = page(simulate, "sim", ["viewer=web"], opened)
+    show = page("sim", ["viewer=web"], opened)
     assert isinstance(show, SimShow)
 
 
@@ -94,7 +94,7 @@ def test_a_bundle_walks_on_the_page_and_hands_over(
     monkeypatch.chdir(tmp_path)
     trained(tmp_path / "run", "terrain=flat")
     (tmp_path / "mine.zip").write_bytes(build(tmp_path / "run", seconds=0.1))
-    show = page(play, "play", ["bundle=mine.zip", "viewer=web", "velocity=[0.3,0,0]"], opened)
+    show = page("play", ["bundle=mine.zip", "viewer=web", "velocity=[0.3,0,0]"], opened)
     assert isinstance(show, WalkShow)
     session = show.session
     assert session.label == "mine"

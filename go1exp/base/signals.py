@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
+from typing import IO
 
 STOPPED = 130
 """Exit status of what a signal ended."""
@@ -50,6 +51,15 @@ def say(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
 
+def silence(stream: IO[str] | None) -> None:
+    """Send what is printed to a stream nowhere."""
+    with suppress(OSError, ValueError, AttributeError):
+        number = stream.fileno()  # type: ignore[union-attr]
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, number)
+        os.close(nowhere)
+
+
 def leave_terminal() -> None:
     """Send what would be printed to a terminal nowhere: after SIGHUP it is gone, and an error must not end the work.
 
@@ -57,8 +67,5 @@ def leave_terminal() -> None:
     """
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):
-            number = stream.fileno()
-            if stat.S_ISCHR(os.fstat(number).st_mode):
-                nowhere = os.open(os.devnull, os.O_WRONLY)
-                os.dup2(nowhere, number)
-                os.close(nowhere)
+            if stat.S_ISCHR(os.fstat(stream.fileno()).st_mode):
+                silence(stream)

@@ -5,12 +5,13 @@ This module imports nothing heavy, so that help and tab completion answer at onc
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import sys
 from types import FrameType
 
-from go1exp.base import signals
+from go1exp.base import errors, signals
 from go1exp.cli.verbs import EVERY as EVERY
 from go1exp.cli.verbs import LISTS as LISTS
 from go1exp.cli.verbs import MODULES as MODULES
@@ -35,16 +36,17 @@ HELP = """usage: go1exp VERB [key=value ...]
 HELP_WORDS = ("-h", "--help", "help")
 """Ask for help; a verb may come after."""
 
-READER_LEFT = 141
-"""Exit status of a closed pipe, 128 + 13 as shells count."""
-
 
 def main() -> int:
-    """Run the verb on the command line; return the exit status.
+    """Run the verb on the command line; return the exit status (``go1exp.base.errors.STATUSES``).
 
-    Ctrl-C, SIGTERM and SIGHUP end it with one line at any time; verbs that have something to save handle them first.
+    Every error, interrupt and closed stream of every verb ends here, in one line. ``HYDRA_FULL_ERROR=1`` shows the
+    traceback instead. Ctrl-C, SIGTERM and SIGHUP do so at any time; verbs that have something to save handle them
+    first.
     """
-    arguments = sys.argv[1:]
+    wants_traceback = os.environ.get("HYDRA_FULL_ERROR") == "1"
+    verb, rest = _verb(sys.argv[1:])
+    title = f"go1exp {verb}".strip().replace("_", " ")
     received: list[int] = []
 
     def interrupt(number: int, frame: FrameType | None) -> None:
@@ -52,54 +54,78 @@ def main() -> int:
         signals.interrupt(number, frame)
 
     try:
+        _need_streams()
         with signals.handled(interrupt):
-            status = _run(arguments)
+            status = _run(verb, rest)
             sys.stdout.flush()
             return status
-    except BrokenPipeError:  # the reader of our output has closed it, as `| head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return READER_LEFT
+    except SystemExit:
+        raise
     except BaseException as error:
-        # A library that is interrupted while it is loaded may raise something else.
-        if not received and not isinstance(error, KeyboardInterrupt):
+        stopped = received or isinstance(error, KeyboardInterrupt)
+        if stopped:  # a library that is interrupted while it is loaded may raise something else
+            signal.signal(signal.SIGINT, signal.SIG_DFL)  # a second Ctrl-C shall not be a traceback
+            return errors.end(KeyboardInterrupt(), title)
+        if wants_traceback and not isinstance(error, BrokenPipeError):
             raise
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # a second Ctrl-C shall not be a traceback
-        signals.say(f"{' '.join(['go1exp', *arguments[:1]])}: stopped")
-        return signals.STOPPED
+        if "go1exp.cli.app" not in sys.modules:
+            return errors.end(error, title)
+        from go1exp.cli.app import explained
+
+        return errors.end(error, title, explained)
 
 
-def _run(arguments: list[str]) -> int:
-    os.environ.setdefault(*ONE_BLAS_THREAD)
-    if arguments[:1] == ["-sc"] and len(arguments) > 1:
-        from go1exp.cli import completion
-
-        return completion.serve(arguments[1])
+def _verb(arguments: list[str]) -> tuple[str, list[str]]:
+    """Return the verb that is meant, such as ``record_audit``, and its arguments; an option in place of a verb too."""
     if len(arguments) > 1 and arguments[0] in HELP_WORDS:
         arguments = [*arguments[1:], "--help"]
-    if not arguments or arguments[0] in HELP_WORDS:
-        print(HELP.format(verbs="\n".join(f"  {verb:12} {text}" for verb, text in VERBS.items())), end="")
+    verb, rest = (arguments[0], arguments[1:]) if arguments else ("", [])
+    return (f"{verb}_{rest[0]}", rest[1:]) if rest and rest[0] in SUBVERBS.get(verb, ()) else (verb, rest)
+
+
+def _need_streams() -> None:
+    """Replace standard streams that are closed, whose numbers the next files would get, by ones to nowhere.
+
+    Raises:
+        Expected: if that of the output is closed.
+    """
+    closed = [number for number, stream in enumerate((sys.stdin, sys.stdout, sys.stderr)) if stream is None]
+    for number in closed:
+        nowhere = os.open(os.devnull, os.O_RDWR)
+        os.dup2(nowhere, number)
+        if nowhere != number:
+            os.close(nowhere)
+    sys.stdout, sys.stderr = (s or io.StringIO() for s in (sys.stdout, sys.stderr))
+    if 1 in closed:
+        raise errors.Expected("standard output is closed; use >/dev/null for none")
+
+
+def _run(verb: str, rest: list[str]) -> int:
+    os.environ.setdefault(*ONE_BLAS_THREAD)
+    if verb == "-sc" and rest:
+        from go1exp.cli import completion
+
+        return completion.serve(rest[0])
+    if not verb or verb in HELP_WORDS:
+        print(HELP.format(verbs="\n".join(f"  {name:12} {text}" for name, text in VERBS.items())), end="")
         return 0
-    if arguments[0] in ("-V", "--version"):
+    if verb in ("-V", "--version"):
         from go1exp import __version__
 
         print(f"go1exp {__version__}")
         return 0
-    verb, rest = arguments[0], arguments[1:]
-    if verb not in VERBS:
+    if verb not in EVERY:
         import difflib
 
         close = difflib.get_close_matches(verb, VERBS, n=1)
         hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(VERBS)}"
-        print(f"go1exp: unknown verb {verb!r}; {hint}", file=sys.stderr)
-        return 2
-    if rest and rest[0] in SUBVERBS.get(verb, ()):
-        verb, rest = f"{verb}_{rest[0]}", rest[1:]
+        raise errors.Expected(f"unknown verb {verb!r}; {hint}", status=errors.REFUSED)
     if {"-h", "--help"} & {*rest}:
         from go1exp.cli.app import defer
         from go1exp.cli.helptext import show
 
         defer("torch")  # help computes nothing
-        show(verb, f"go1exp {verb.replace('_', ' ')}", rest)
+        show(verb, rest)
         return 0
     from go1exp.cli.app import app_of
 

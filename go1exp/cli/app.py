@@ -17,48 +17,51 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 import go1exp.cli.hydra_main as hydra_main
+from go1exp.base import errors
 from go1exp.cli.hydra_main import choices_from_files
 from go1exp.cli.verbs import FLAGS, MODULES, VALUED, protected
 from go1exp.config.choices import CONFIG_DIR, choice_files, config_folder, given_folders
 from go1exp.config.compose import as_hydra_takes_them, composition_problem
-from go1exp.config.hydra_adapter import REFUSED
+from go1exp.config.hydra_adapter import REFUSED, plain
 from go1exp.config.schema import plugins
 from go1exp.config.schema import settings as schema
-from go1exp.config.schema.registry import ConfigError, Expected, unknown_name
-
-BAD_CONFIG, FAILED = 2, 1
-"""Exit statuses: configuration refused before anything was built; the work failed. What a signal ended has
-``go1exp.base.signals.STOPPED``."""
+from go1exp.config.schema.registry import ConfigError, unknown_name
 
 
 @dataclass(frozen=True)
 class App:
     """One verb: ``conf/<name>.yaml`` and the function that gets the composed, resolved configuration.
 
-    ``task`` returns an exit status, or None for 0. ConfigError, OSError and ``Expected`` are answers, not bugs: their
-    message is printed without a traceback.
+    ``task`` returns an exit status, or None for 0; what it raises ends the command (``go1exp.base.errors``).
     """
 
     name: str
     task: Callable[[dict[str, Any]], int | None]
     settings: type | None = None
     """Class of the settings that are no group's, for the help; None for ``train``, whose are in ``go1exp.sim.task``."""
-    title: str = ""
-    """What users call it, where that is not its name."""
     sweep: Callable[[App, Sequence[Path], hydra_main.Sweep], int] | None = None
     """Runs a sweep: ``(verb, the user's folders, sweep) -> exit status``; None leaves sweeps to Hydra."""
 
+    @property
+    def title(self) -> str:
+        """What users call it."""
+        return f"go1exp {self.name.replace('_', ' ')}"
+
     def run(self, arguments: Sequence[str]) -> int:
-        """Run with command-line arguments; print errors; return the exit status."""
-        wants_traceback = os.environ.get("HYDRA_FULL_ERROR") == "1"
+        """Run with command-line arguments; return the exit status.
+
+        Raises:
+            ConfigError: if the settings are refused.
+            Exception: what the task raises.
+        """
         defer("torch")
         warnings.filterwarnings("ignore", message="The `render_mode` attribute is not defined")
         status: list[int | None] = []
         failure: list[Exception] = []
 
-        def task(container: dict[str, Any]) -> None:
+        def task(config: Any) -> None:
             try:
-                status.append(self.task(begin(self.name, container)))
+                status.append(self.task(begin(self.name, plain(config))))
             except Exception as error:
                 if hydra_main.in_multirun():
                     job = hydra_main.job()
@@ -66,30 +69,21 @@ class App:
                 else:
                     failure.append(error)  # Hydra would print a report of its own
 
-        title = f"go1exp {self.title or self.name}"
         formatwarning = warnings.formatwarning  # usually two lines, one of them of code
-        warnings.formatwarning = lambda message, *rest, **keywords: f"{title}: warning: {message}\n"
+        warnings.formatwarning = lambda message, *rest, **keywords: f"{self.title}: warning: {message}\n"
         try:
-            _refuse_stray_words(arguments, title)
+            _refuse_stray_words(arguments, self.title)
             overrides, folders = _without_config_dir(choices_from_files(arguments, self.name))
             _refuse_unknown_schedule(overrides, folders)
-            argv = [title, *map(protected, as_hydra_takes_them(overrides))]
+            argv = [self.title, *map(protected, as_hydra_takes_them(overrides))]
             sweep = self.sweep
             on_sweep = None if sweep is None else lambda asked: sweep(self, folders, asked)
             status.append(hydra_main.run(self.name, argv, folders, task, on_sweep))
             if failure:
                 raise failure[0]
-            sys.stdout.flush()
-        except BrokenPipeError:  # the command line's to answer
-            raise
         except Exception as error:
-            if wants_traceback:
-                raise error from None
-            code, message = self._explain(error, arguments)
-            print(f"{title}: {message}", file=sys.stderr)
-            return code
+            raise self._as_refusal(error, arguments) from error.__cause__
         finally:
-            _announced.clear()
             while _bars:  # one that an error leaves behind hides the terminal's cursor
                 _bars.pop().stop()
             warnings.formatwarning = formatwarning
@@ -97,46 +91,38 @@ class App:
 
     def failed_in_sweep(self, error: Exception, number: int, overrides: Sequence[str]) -> int:
         """Print what went wrong with a job of a sweep and return its status: the other jobs do not depend on it."""
-        try:
-            status, message = self._explain(error, overrides)
-        except Exception:
-            traceback.print_exc()
-            status, message = FAILED, self.cause(error)
-        name = f"go1exp {self.title or self.name}: job {number} ({' '.join(overrides)})"
-        print(f"{name}: {message}", file=sys.stderr, flush=True)
-        return status
+        error = self._as_refusal(error, overrides)
+        return errors.end(error, f"{self.title}: job {number} ({' '.join(overrides)})", explained)
 
     def cause(self, error: Exception, overrides: Sequence[str] = ()) -> str:
         """Return what went wrong in one line, whatever it was."""
-        try:
-            message = self._explain(error, overrides)[1]
-        except Exception:  # a bug: its kind says more than its message
-            message = f"{type(error).__name__}: {error}"
-        return " ".join(message.split())
+        answer = explained(self._as_refusal(error, overrides))
+        return " ".join((answer[1] if answer else f"{type(error).__name__}: {error}").split())
 
-    def _explain(self, error: Exception, arguments: Sequence[str]) -> tuple[int, str]:
-        """Return exit status and message of an exception; re-raise what is a bug."""
-        if isinstance(error, ConfigError):
-            lines = error.problems
-            return BAD_CONFIG, lines[0] if len(lines) == 1 else "\n  ".join([f"{len(lines)} problems", *lines])
-        if isinstance(error, (*REFUSED, ValueError)):
+    def _as_refusal(self, error: Exception, arguments: Sequence[str]) -> Exception:
+        """Return a ConfigError in place of an error that the arguments caused in Hydra; any other error as it is."""
+        if isinstance(error, REFUSED) and not hasattr(error, "problems"):
             problem = composition_problem(error, self.name, arguments, given_folders(arguments)[1:])
-            if problem:
-                return BAD_CONFIG, problem
-        if isinstance(error, OSError):
-            return FAILED, f"{error.strerror}: {error.filename}" if error.strerror and error.filename else str(error)
-        if isinstance(error, Expected):
-            return FAILED, str(error)
-        if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":  # the latter is torch's
-            return FAILED, f"out of memory: {' '.join(str(error).split())}"
-        raise error
+            return ConfigError([problem]) if problem else error
+        return error
+
+
+def explained(error: BaseException) -> tuple[int, str] | None:
+    """Return exit status and message of an error that is an answer, also of one in a user's plugin; None of others."""
+    if answer := errors.explained(error):
+        return answer
+    library = os.environ.get("MUJOCO_GL")
+    if library and any(f.filename.endswith("gl_context.py") for f in traceback.extract_tb(error.__traceback__)):
+        return errors.REFUSED, f"MUJOCO_GL={library}: MuJoCo cannot load this GL library; leave the variable unset"
+    if place := plugins.blamed(error):
+        return errors.FAILED, f"{place}: {type(error).__name__}: {' '.join(str(error).split())}"
+    return None
 
 
 def app_of(verb: str) -> App:
-    """Return a verb's application; that of a second word, such as ``record_audit``, has this word's name."""
+    """Return a verb's application."""
     module = importlib.import_module(f"go1exp.cli.{MODULES.get(verb, verb)}")
-    app: App = getattr(module, verb.partition("_")[2].upper() or "APP")
-    return app
+    return next(app for app in vars(module).values() if isinstance(app, App) and app.name == verb)
 
 
 MODES = ("--run", "-r", "--multirun", "-m", "--cfg", "-c", "--info", "-i")
@@ -152,7 +138,7 @@ def _refuse_stray_words(arguments: Sequence[str], title: str) -> None:
         if word.startswith("-"):
             if word.partition("=")[0] not in (*VALUED, *FLAGS):
                 problems.append(f"{word}: unknown option; see {title} --help")
-        elif "=" not in word and not word.startswith("~"):
+        elif ("=" not in word and not word.startswith("~")) or word.lstrip("+").startswith("="):
             problems.append(f"{word}: not a setting, which is key=value; see {title} --help")
     modes = [word for word in arguments if word.partition("=")[0] in MODES]
     if len(modes) > 1:
@@ -211,21 +197,24 @@ def discard(run: Path, of_lock: Sequence[str] = ()) -> None:
 
 
 _bars: list[Any] = []
-_announced: list[str] = []
 
 LINE_PERIOD = 5.0
 """Least time between two lines of progress when there is no terminal, s."""
 
 
 def announce(what: str) -> None:
-    """Print what begins, once, where there is no terminal: libraries take seconds to load."""
-    if not sys.stderr.isatty() and what not in _announced:
-        _announced.append(what)
+    """Print what begins where there is no terminal: libraries take seconds to load."""
+    if not sys.stderr.isatty():
         print(f"{what} ...", file=sys.stderr, flush=True)
 
 
-def spinner(total: int, what: str) -> Callable[[int, int], None]:
-    """Return a callback ``(done, total)`` that shows a progress bar in a terminal, and lines elsewhere."""
+def spinner(total: int, what: str, at_once: bool = False) -> Callable[[int, int], None]:
+    """Return a callback ``(done, total)`` that shows a progress bar in a terminal, and lines elsewhere.
+
+    The first line comes after a while, or ``at_once``.
+    """
+    if at_once:
+        announce(what)
     if not sys.stderr.isatty():
         printed_at = [time.monotonic()]
 

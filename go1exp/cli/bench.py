@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field
 
 from go1exp.base.files import write_json
-from go1exp.cli.app import App, announce, parse, spinner
+from go1exp.cli.app import App, parse, spinner
 from go1exp.cli.record import RecordSettings
 from go1exp.config.compose import compose
 from go1exp.config.schema import settings as schema
@@ -75,8 +75,7 @@ GOALS = {
 
 def _task(container: dict[str, Any]) -> None:
     settings = parse(BenchSettings, container)
-    announce(f"measuring {settings.suite}")
-    show = spinner(settings.rounds, f"measuring {settings.suite}")
+    show = spinner(settings.rounds, f"measuring {settings.suite}", at_once=True)
 
     from go1exp.sim.task import parse_train
 

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from go1exp.base.errors import REFUSED, Expected
 from go1exp.base.paths import data_root
 from go1exp.cli.verbs import POSITIONAL, SUBVERBS, VALUED, VERBS
 from go1exp.config.choices import CONFIG_DIR, choice_files, config_folder, given_folders, groups_in, groups_of, load
@@ -91,10 +92,7 @@ def serve(request: str) -> int:
     if action != "query":
         script = SCRIPTS.get(action, {}).get(shell)
         if script is None:
-            import sys
-
-            print(f"go1exp: -sc {request}: install, uninstall or query = bash, zsh or fish", file=sys.stderr)
-            return 2
+            raise Expected(f"-sc {request}: install, uninstall or query = bash, zsh or fish", status=REFUSED)
         print(script)
         return 0
     line = os.environ.get("COMP_LINE", "")

@@ -102,7 +102,6 @@ def _task(container: dict[str, Any]) -> int:
 
     from go1exp.deploy.runtime.commands import CommandConfig
     from go1exp.deploy.runtime.job import Job, run_job
-    from go1exp.deploy.runtime.launch import RefusedError
     from go1exp.deploy.runtime.walk import Plan
 
     existed = Path(settings.out).exists()
@@ -126,8 +125,6 @@ def _task(container: dict[str, Any]) -> int:
     )
     try:
         return run_job(job, partial(print, flush=True))
-    except RefusedError as error:
-        raise ConfigError(error.problems) from None
     finally:
         if not existed:
             remove_empty(Path(settings.out))

@@ -314,8 +314,7 @@ def _grid(
     settings: Any, measures: list[Term], conditions: _Conditions, run: Path, checkpoint: Path | None, out: Path
 ) -> None:
     """Play the grid of constant commands."""
-    announce("evaluating")
-    show = spinner(1, "evaluating")
+    show = spinner(1, "evaluating", at_once=True)
     from go1exp.config.schema.settings import subset
     from go1exp.evaluate import criteria, table
     from go1exp.evaluate.quantities import write as write_report

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -93,11 +94,12 @@ def _check(container: dict[str, Any]) -> None:
 
     bundle = load(Path(settings.file))
     refuse_unfit(bundle)
-    console = Console(highlight=False, emoji=False, markup=False, soft_wrap=False)
-    if not console.is_terminal:
-        console = Console(width=WIDTH, highlight=False, emoji=False, markup=False)
-    for table in tables(bundle):
-        console.print(table)
+    width = None if sys.stdout.isatty() else WIDTH
+    console = Console(width=width, highlight=False, emoji=False, markup=False, soft_wrap=False)
+    with console.capture() as text:  # a reader that leaves ends rich with status 1
+        for table in tables(bundle):
+            console.print(table)
+    print(text.get(), end="")
     worst = max(bundle.differences.values())
     steps = len(bundle.trace["time"])
     print(f"good: every hash matches, {steps} steps replayed, largest difference {worst:.1e}")
@@ -165,7 +167,7 @@ def estimator(settings: dict[str, Any]) -> str:
     return ", ".join(parts) or "no settings of its own: those of a Go1"
 
 
-CHECK = App("export_check", _check, ExportCheckSettings, title="export check")
+CHECK = App("export_check", _check, ExportCheckSettings)
 
 
 @schema.settings
@@ -199,4 +201,4 @@ def _import(container: dict[str, Any]) -> None:
         print(line)
 
 
-IMPORT = App("export_import", _import, ExportImportSettings, title="export import")
+IMPORT = App("export_import", _import, ExportImportSettings)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
 
+from go1exp.base.errors import DOES_NOT_HOLD, EXIT_CODES
 from go1exp.base.files import opened, write_json
 from go1exp.cli.app import App, parse_with_groups, spinner
 from go1exp.cli.places import long_enough, read_all, writable
@@ -71,10 +72,6 @@ class GapVerb:
             refuse_no_logs(self.logs)
 
 
-DOES_NOT_HOLD = 15
-"""Exit status if the certified effects fit worse at the step of training."""
-
-
 def with_logs(container: dict[str, Any]) -> dict[str, Any]:
     """Return the settings with no logs where none are needed: ``report`` and ``view`` read the answer alone.
 
@@ -103,7 +100,6 @@ def _task(container: dict[str, Any]) -> int:
     out, where = Path(settings.out), address(settings.host, settings.port)
 
     from go1exp.gap import files
-    from go1exp.gap.result import EXIT_CODES
 
     if settings.stage == "report":
         return _report(files.load(out), out)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
+from go1exp.base.errors import FAILED, NOT_SEPARABLE
 from go1exp.base.files import write_json
 from go1exp.cli.app import App, parse_with_groups
 from go1exp.cli.gap import Logs, _progress, refuse_no_logs, refuse_unknown
@@ -72,9 +73,6 @@ class GapLoopSettings(RecordingConfig):
         if wrong:
             raise ValueError("\n".join(wrong))
 
-
-NOT_SEPARABLE = 16
-"""Exit status if no recording distinguishes the remaining explanations."""
 
 TARGETS, ANSWER = "next.csv", "next.json"
 """Names of the files in the output folder."""
@@ -170,7 +168,7 @@ def _attitude(attitude: Any) -> str:
     return f"the trunk at roll {attitude.roll:g} and pitch {attitude.pitch:g} rad"
 
 
-NEXT = App("gap_next", _next, GapNextSettings, title="gap next")
+NEXT = App("gap_next", _next, GapNextSettings)
 
 
 TABLE = "loop.json"
@@ -218,7 +216,7 @@ def _loop(container: dict[str, Any]) -> int:
     )
     write_json(out / TABLE, [row.as_dict() for row in rows], indent=1)
     print(f"\n{table(rows)}\n\nwritten to {out / TABLE}")
-    return 0 if rows[-1].ended == "one name is left" else 1
+    return 0 if rows[-1].ended == "one name is left" else FAILED
 
 
 def _keep(turn: Turn, out: Path) -> None:
@@ -237,4 +235,4 @@ def _keep(turn: Turn, out: Path) -> None:
     print(f"\n{table([turn.row])}\n", flush=True)
 
 
-LOOP = App("gap_loop", _loop, GapLoopSettings, title="gap loop")
+LOOP = App("gap_loop", _loop, GapLoopSettings)

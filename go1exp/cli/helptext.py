@@ -1,4 +1,4 @@
-"""``go1exp VERB --help``: what a verb does, its groups, every setting in one line, examples.
+"""``go1exp VERB --help``: what a verb does, its groups, every setting in one line, examples; and ``go1exp list``.
 
 Nothing is written twice: the settings' lines come from the docstrings of their classes, values from ``conf/``, what a
 verb does and its examples from ``hydra.help`` in ``conf/VERB.yaml``.
@@ -7,20 +7,23 @@ verb does and its examples from ``hydra.help`` in ``conf/VERB.yaml``.
 from __future__ import annotations
 
 import shutil
-import sys
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from go1exp.cli.app import MEANING, App, app_of, parse
+from go1exp.cli.hydra_main import choices_from_files
 from go1exp.cli.verbs import LISTS, POSITIONAL, SUBVERBS, VALUED
-from go1exp.config.choices import about, choice_files, config_folder, given_folders, groups_of, load
+from go1exp.config.choices import about, choice_files, config_folder, given_folders, groups_in, groups_of, load
+from go1exp.config.compose import compose
+from go1exp.config.hydra_adapter import shown_folders
+from go1exp.config.schema import plugins, registry
+from go1exp.config.schema import settings as schema
+from go1exp.config.schema.registry import ConfigError, members, nearest, unknown_name
 
 KEY_WIDTH = 34
 """Columns of ``key=value`` before the text beside it."""
-
-NO_SUCH_WORD = 2
-"""Exit status, that of a refused configuration."""
 
 WITHOUT = {
     "experiment": "",
@@ -36,15 +39,15 @@ WITHOUT_IN = {
 """The same for a group of one verb."""
 
 
-def show(verb: str, title: str, arguments: Sequence[str]) -> None:
+def show(verb: str, arguments: Sequence[str]) -> None:
     """Print the help of a verb, or of the group that is named among the arguments.
 
     Raises:
-        SystemExit: if a word among them names nothing that there is help for.
+        ConfigError: if a word among them names nothing that there is help for.
     """
-    words = _words(arguments)
+    words, title = _words(arguments), f"go1exp {verb.replace('_', ' ')}"
     if subverb := next((word for word in words if word in SUBVERBS.get(verb, ())), None):
-        show(f"{verb}_{subverb}", f"{title} {subverb}", [word for word in arguments if word != subverb])
+        show(f"{verb}_{subverb}", [word for word in arguments if word != subverb])
         return
     folders = given_folders(arguments)
     groups = groups_of(verb)
@@ -54,7 +57,9 @@ def show(verb: str, title: str, arguments: Sequence[str]) -> None:
     strange = [word for word in words if word not in {*groups, *keys, *sections}]
     positional = POSITIONAL.get(verb, ())  # words for themselves, as the file in ``go1exp deploy walk.zip --help``
     if len(strange) > len(positional) and not {*positional} & {*LISTS}:
-        _refuse(title, strange[-1], [*groups, *keys])
+        close = " or ".join(repr(name) for name in nearest(strange[-1], [*groups, *keys]))
+        hint = f"did you mean {close}?" if close else f"{title} --help lists them"
+        raise ConfigError([f"no group or key {strange[-1]!r}; {hint}"])
     named = next((group for word in words if (group := word.partition(".")[0]) in groups), None)
     print("\n".join(_group_page(title, named, groups, container, folders) if named else _page(verb, title, container)))
 
@@ -68,21 +73,8 @@ def _words(arguments: Sequence[str]) -> list[str]:
     ]
 
 
-def _refuse(title: str, word: str, known: Sequence[str]) -> None:
-    """Print that there is no help for a word, and the nearest ones; exit."""
-    from go1exp.config.schema.registry import nearest
-
-    close = " or ".join(repr(name) for name in nearest(word, known))
-    hint = f"did you mean {close}?" if close else f"{title} --help lists them"
-    print(f"{title}: no group or key {word!r}; {hint}", file=sys.stderr)
-    raise SystemExit(NO_SUCH_WORD)
-
-
 def _composed(verb: str, arguments: Sequence[str], folders: Sequence[Path]) -> dict[str, Any]:
     """Compose with the overrides among the arguments, or without them where they are wrong: help is for that too."""
-    from go1exp.cli.hydra_main import choices_from_files
-    from go1exp.config.compose import compose
-
     overrides = [word for word in arguments if "=" in word and not word.startswith("-")]
     try:
         return compose(verb, choices_from_files(overrides, verb), folders)
@@ -131,48 +123,43 @@ def _group_page(
 
 def _slots(group: str) -> list[str]:
     """Explain the keys that every term of a group may have beside its own parameters."""
-    from go1exp.config.schema.settings import attributes
     from go1exp.config.schema.training import Ramp
     from go1exp.sim.task import MANY_TERMS
 
     slots = MANY_TERMS.get(group, Ramp if group == "schedule" else None)
-    texts, item = (attributes(slots) if slots else {}), "NAME" if slots is Ramp else "TERM"
+    texts, item = (schema.attributes(slots) if slots else {}), "NAME" if slots is Ramp else "TERM"
     lines = [line for name, text in texts.items() for line in _beside(f"{group}.{item}.{name}", text)]
     return ["", *lines] if lines else []
 
 
 def texts_of(verb: str) -> dict[str, str]:
     """Return what each setting of a verb means, by key path, groups left out."""
-    from go1exp.cli.app import MEANING, app_of
-    from go1exp.config.schema.plugins import KEY
-    from go1exp.config.schema.settings import lines
-
     if kind := app_of(verb).settings:
-        return {**lines(kind), KEY: MEANING}
+        return {**schema.lines(kind), plugins.KEY: MEANING}
     from go1exp.sim.task import SECTIONS, ProcessConfig
 
     sections = [name for name in SECTIONS if name not in groups_of(verb)]
-    return lines(ProcessConfig) | {k: v for name in sections for k, v in lines(SECTIONS[name], f"{name}.").items()}
+    return schema.lines(ProcessConfig) | {
+        k: v for name in sections for k, v in schema.lines(SECTIONS[name], f"{name}.").items()
+    }
 
 
 def _texts_of_group(group: str, settings: Mapping[str, Any]) -> dict[str, str]:
     """Return what the keys of a group mean: those of a section by its class, a term by its docstring."""
     from go1exp.config.schema.physics import BACKENDS
-    from go1exp.config.schema.registry import members
-    from go1exp.config.schema.settings import lines
     from go1exp.evaluate.controller.settings import CONTROLLERS
     from go1exp.sim.task import ENGINES, ONE_TERM, REGISTERED_AS, SECTIONS
 
     by_name = {**dict.fromkeys(ENGINES, BACKENDS), "controller": CONTROLLERS}
     if group in by_name:
-        return lines(by_name[group][settings["name"]], f"{group}.")
+        return schema.lines(by_name[group][settings["name"]], f"{group}.")
     if group in SECTIONS:
-        return lines(SECTIONS[group], f"{group}.")
+        return schema.lines(SECTIONS[group], f"{group}.")
     if group == "protocol":
         import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
         from go1exp.evaluate.protocol.base import kinds
 
-        return {k: v for key, kind in kinds(settings).items() for k, v in lines(kind, f"{group}.{key}.").items()}
+        return {k: v for key, kind in kinds(settings).items() for k, v in schema.lines(kind, f"{group}.{key}.").items()}
     terms = members(REGISTERED_AS.get(group, group))
     if group in ONE_TERM:
         return {f"{group}.term": terms[settings["term"]].doc}
@@ -216,3 +203,64 @@ def _beside(key: str, text: str, width: int = KEY_WIDTH) -> list[str]:
     if len(key) > width:
         return [f"  {key}", *(f"{indent}{line}" for line in wrapped if line)]
     return [f"  {key:{width}}  {wrapped[0]}".rstrip(), *(f"{indent}{line}" for line in wrapped[1:])]
+
+
+@schema.settings
+class ListSettings:
+    """``conf/list.yaml``.
+
+    Attributes:
+        what: terms, groups, or all.
+        group: only this group, such as reward or rand.
+    """
+
+    what: Literal["all", "terms", "groups"]
+    group: str | None
+
+
+def _list(container: dict[str, Any]) -> None:
+    import go1exp.evaluate.protocol.kinds
+    import go1exp.logs.excitations
+    import go1exp.logs.importers
+    import go1exp.logs.record.motions  # noqa: F401  (registers every member)
+
+    plugins.installed()
+    settings = parse(ListSettings, container)
+    choices = _every_choice()
+    known = sorted({*registry.groups(), *choices})
+    wanted = settings.group
+    if wanted is not None and wanted not in known:
+        wanted = wanted.removesuffix("s")  # effects as well as effect
+    if wanted is not None and wanted not in known:
+        raise ConfigError([unknown_name("group", str(settings.group), known, "group")])
+    for group in known:
+        if wanted in (None, group):
+            _print_group(group, choices.get(group, []), settings.what)
+
+
+def _print_group(group: str, choices: list[tuple[str, str]], what: str) -> None:
+
+    terms = members(group)
+    print(group)
+    if what != "terms":
+        for name, about in choices:
+            print(f"  {group}={name:26} {about}")
+    if what != "groups":
+        for entry in terms.values():
+            source = plugins.origin(entry)
+            print(f"  {entry.name:{len(group) + 27}} {entry.doc}{f'  [{source}]' if source else ''}")
+            if entry.parameters:
+                parameters = entry.parameters.values()
+                texts = (p.name if p.default is p.empty else f"{p.name}={p.default!r}" for p in parameters)
+                print(f"  {'':{len(group) + 27}}   {', '.join(texts)}")
+    print()
+
+
+def _every_choice() -> dict[str, list[tuple[str, str]]]:
+    """Return the choices of each group with the first sentence of their file's comment, a user's own included."""
+    folders = shown_folders()
+    groups = dict.fromkeys(group for folder in folders for group in groups_in(folder))
+    return {group: [(name, about(file)) for name, file in choice_files(group, folders).items()] for group in groups}
+
+
+APP = App("list", _list, ListSettings)

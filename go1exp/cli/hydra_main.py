@@ -14,6 +14,9 @@ from typing import Any
 import hydra
 import yaml
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, RangeSweep
+from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
@@ -130,7 +133,7 @@ def run(
     verb: str,
     argv: Sequence[str],
     folders: Sequence[Path],
-    task: Callable[[dict[str, Any]], None],
+    task: Callable[[DictConfig], None],
     on_sweep: Callable[[Sweep], int | None] | None = None,
 ) -> int | None:
     """Compose ``conf/<verb>.yaml`` with Hydra's command line and call ``task`` with each job's configuration.
@@ -139,7 +142,7 @@ def run(
         verb: name of the configuration.
         argv: title and arguments.
         folders: the user's folders of choices.
-        task: gets the resolved configuration.
+        task: gets the composed configuration; must not raise.
         on_sweep: runs a sweep in place of Hydra's sweeper; returns the exit status.
 
     Returns:
@@ -151,13 +154,33 @@ def run(
     _on_sweep[:] = [on_sweep] if on_sweep else []
     try:
         with seen_by(verb, folders), composed_once(argv[1:], folders):
-            hydra.main(**MAIN, config_path=None, config_name=verb)(lambda config: task(plain(config)))()
+            hydra.main(**MAIN, config_path=None, config_name=verb)(task)()
     except Left as left:
         return left.work()
     finally:
         if before is None:
             os.environ.pop("HYDRA_FULL_ERROR", None)
     return None
+
+
+def sweep_range(text: str) -> tuple[str, dict[str, Any]]:
+    """Return key and range of an override in Hydra's grammar for sweeps: low, high, step, log; or choices.
+
+    Raises:
+        ValueError: if the text is no range of a key.
+    """
+    try:
+        (override,) = OverridesParser.create().parse_overrides([text])
+    except HydraException as error:
+        raise ValueError(text) from error
+    value = override.value()
+    if isinstance(value, IntervalSweep) and value.start is not None and value.end is not None:
+        return override.key_or_group, {"low": value.start, "high": value.end, "log": "log" in value.tags}
+    if isinstance(value, RangeSweep) and isinstance(value.start, int) and isinstance(value.stop, int):
+        return override.key_or_group, {"low": value.start, "high": value.stop - 1, "step": int(value.step)}
+    if isinstance(value, ChoiceSweep):
+        return override.key_or_group, {"choices": tuple(override.sweep_string_iterator())}
+    raise ValueError(text)
 
 
 PATHS = {"model": "mjcf"}

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from go1exp.base.errors import REFUSED
 from go1exp.base.paths import data_root
 from go1exp.config.schema.registry import ConfigError, unknown_name
 
@@ -87,7 +88,7 @@ def files_of(places: str | Sequence[str]) -> list[Path]:
     for path in map(Path, [places] if isinstance(places, str) else places):
         inside = sorted(path.glob("*.parquet"))
         if path.is_dir() and not inside:
-            raise RecordingError(f"{path}: no *.parquet in it")
+            raise RecordingError(f"{path}: no *.parquet in it", status=REFUSED)
         files += inside if path.is_dir() else [path]
     return files
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from go1exp.base import memory
 from go1exp.cli import subjects
-from go1exp.cli.app import App, announce, parse, spinner
+from go1exp.cli.app import App, parse, spinner
 from go1exp.cli.evaluate import writable_file
 from go1exp.cli.play_web import PlaySettings, address, log, walk
 from go1exp.cli.subjects import agent
@@ -51,7 +52,7 @@ def _task(container: dict[str, Any]) -> None:
     live = settings.viewer == "live" or (settings.viewer == "auto" and has_display)
     if not live:
         writable_file(out)
-        announce("recording a video")
+    progress = None if live else spinner(1, "recording a video", at_once=True)
 
     from go1exp.config.schema.settings import subset
     from go1exp.evaluate.rollout import EvalConfig, evaluation_task, require_agreement
@@ -65,7 +66,7 @@ def _task(container: dict[str, Any]) -> None:
         shown_task = dataclasses.replace(shown_task, terrain=ground)
     require_agreement(shown_task)
     core = Go1Core(shown_task, 1, settings.seed, noise=settings.noise, imu=drives.senses)
-    _show(core, drives.begin(core, "exact", settings.seed), settings, None if live else out)
+    _show(core, drives.begin(core, "exact", settings.seed), settings, out, progress)
 
 
 def _ground(given: Any) -> TerrainConfig | None:
@@ -95,19 +96,20 @@ def _log(settings: PlaySettings, where: tuple[str, int]) -> None:
     log(Path(str(settings.log)), where)
 
 
-def _show(core: Go1Core, policy: Policy, settings: PlaySettings, out: Path | None) -> None:
-    """Write clip and picture, or open the live viewer if there is no file for them."""
+def _show(
+    core: Go1Core, policy: Policy, settings: PlaySettings, out: Path, progress: Callable[[int, int], None] | None
+) -> None:
+    """Write clip and picture, with their ``progress``, or open the live viewer without one."""
     from go1exp.evaluate import video
     from go1exp.evaluate.stick import picture
     from go1exp.sim.env.camera import RenderingUnavailable
 
-    if out is None:
+    if progress is None:
         video.live(core, policy)
         return
     if video.length(settings.seconds, settings.fps) < 1:
         raise ConfigError([f"seconds = {settings.seconds:g}: shorter than a picture at fps = {settings.fps}"])
     core.command.value[:] = core.command.value.new_tensor(settings.velocity)
-    progress = spinner(1, "recording a video")
     try:
         frames = video.record(core, policy, settings.seconds, fps=settings.fps, on_frame=progress, footfalls=True)
     except RenderingUnavailable as error:

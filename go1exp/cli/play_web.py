@@ -1,10 +1,11 @@
-"""``go1exp play viewer=web`` and ``go1exp play log=FILE``: what there is to choose from, and the window."""
+"""``go1exp sim``, and ``go1exp play`` in the browser (``viewer=web``, ``log=FILE``): what there is, and the window."""
 
 from __future__ import annotations
 
 import importlib
 import importlib.util
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -12,16 +13,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field
 
 from go1exp.base.errors import Expected
+from go1exp.cli.app import App, parse_with_groups
 from go1exp.cli.places import shipped_policies
 from go1exp.cli.subjects import Named, agent, word
 from go1exp.config.choices import choice_files, config_folder, load
 from go1exp.config.schema import settings as schema
 from go1exp.config.schema.registry import ConfigError, Duration, FolderName, Speed
+from go1exp.config.schema.settings import subset
+from go1exp.deploy.sim_robot.settings import SimConfig, SimSettings
 
 if TYPE_CHECKING:
     from go1exp.config.schema.physics import BackendConfig
     from go1exp.deploy.sim_robot.machine import Body
-    from go1exp.deploy.sim_robot.settings import SimConfig
     from go1exp.evaluate.agents import Agent
     from go1exp.evaluate.viewer.requests import Ground
     from go1exp.gap.robots.protocol import Robot
@@ -188,7 +191,7 @@ def _grounds(wanted: TerrainConfig | None) -> tuple[str, dict[str, Ground]]:
     return name, grounds(known)
 
 
-def sim(
+def _sim_page(
     body: Body,
     groups: dict[str, Any],
     config: SimConfig,
@@ -267,3 +270,45 @@ def gap(folder: Path, robot: Robot, config: RobotConfig, where: tuple[str, int])
     model = None if set(robot.joints) == set(JOINTS) else model_of(robot)
     show = ReplayShow(story, config, model)
     web.run(show, [ReplayWindow(story)], title=f"go1exp gap: {folder}", host=where[0], port=where[1])
+
+
+BODY = ("robot", "actuator", "effect", "contact", "terrain")
+"""Groups of the configuration that describe the robot and its ground."""
+
+
+def _sim(container: dict[str, Any]) -> int:
+    from go1exp import robot
+    from go1exp.deploy.runtime.udp import parsed_address
+    from go1exp.deploy.sim_robot.machine import Body, Robot
+    from go1exp.sim.effects.rules import actuator_problems
+
+    settings, parts = parse_with_groups(SimSettings, container, BODY)
+    if problems := actuator_problems(parts["actuator"], parts["effect"], robot.JOINTS):
+        raise ConfigError(problems)
+    where, page = parsed_address(settings.address, HERE), address(settings.host, settings.port)
+    body, config = Body(**parts, tile=settings.tile), subset(SimConfig, settings)
+    if settings.viewer == "web":
+        groups = {name: container[name] for name in BODY}
+        _sim_page(body, groups, config, where, settings.seconds, page)
+        return 0
+
+    import torch
+
+    from go1exp.deploy.sim_robot.alone import greeting, serve
+    from go1exp.deploy.sim_robot.server import Server
+
+    torch.set_num_threads(1)
+    server = Server(Robot(body, config), config, where[1], where[0])
+    print(greeting(settings.start, server.address), flush=True)
+    try:
+        with suppress(KeyboardInterrupt):  # its usual end
+            serve(server, lambda: True, partial(print, flush=True), settings.seconds)
+    finally:
+        server.close()
+    return 0
+
+
+HERE = ("127.0.0.1", 8007)
+"""Default address; it cannot be reached from the network."""
+
+SIM = App("sim", _sim, SimSettings)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
+from go1exp.base import errors
 from go1exp.base.files import write_json
 from go1exp.base.wording import counted
 from go1exp.cli.app import App, parse, parse_with_groups, spinner
@@ -240,10 +241,6 @@ def _write(out: Path, recordings: list[Recording]) -> None:
 APP = App("record", _record, RecordSettings)
 
 
-AUDIT_STATUS = {"ok": 0, "suspect": 3, "bad": 4}
-"""Exit status of each verdict; the worst counts."""
-
-
 def _audit(container: dict[str, Any]) -> int:
     from go1exp.logs.recording import RecordingError
 
@@ -253,14 +250,14 @@ def _audit(container: dict[str, Any]) -> int:
 
     reports: dict[str, Any] = {}
     folders: dict[Path, dict[Path, AuditReport]] = {}
-    unreadable: list[str] = []
+    unreadable: list[RecordingError] = []
     status = 0
     files = files_of(settings.files)
     for file in files:
         try:
             report = audit_file(file)
         except RecordingError as error:
-            unreadable.append(str(error))
+            unreadable.append(error)
             reports[str(file)] = {"verdict": "unreadable", "message": str(error)}
             continue
         print(
@@ -270,14 +267,14 @@ def _audit(container: dict[str, Any]) -> int:
         )
         reports[str(file)] = report.as_dict()
         folders.setdefault(file.parent, {})[file] = report
-        status = max(status, AUDIT_STATUS[report.verdict])
+        status = max(status, errors.AUDIT[report.verdict])
     for together in folders.values():
         flaws = clock_flaws(list(together.values()))
         for file, report in together.items():
             if report.episode in flaws:
                 print(f"{file}: bad: {flaws[report.episode]}")
                 reports[str(file)] |= {"verdict": "bad", "clocks": flaws[report.episode]}
-                status = max(status, AUDIT_STATUS["bad"])
+                status = max(status, errors.AUDIT["bad"])
     if settings.out:
         out = Path(settings.out)
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -287,11 +284,11 @@ def _audit(container: dict[str, Any]) -> int:
         counts = Counter(report["verdict"] for report in reports.values())
         print(f"{len(files)} recordings: {', '.join(f'{n} {verdict}' for verdict, n in counts.items())}")
     if unreadable:  # the others have been audited
-        raise RecordingError("\n".join(unreadable))
+        raise RecordingError("\n".join(map(str, unreadable)), status=max(error.status for error in unreadable))
     return status
 
 
-AUDIT = App("record_audit", _audit, AuditSettings, title="record audit")
+AUDIT = App("record_audit", _audit, AuditSettings)
 
 
 NAMED = 3
@@ -356,4 +353,4 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:NAMED]) + (f" and {rest} more" if rest > 0 else "")
 
 
-IMPORT = App("record_import", _import, ImportSettings, title="record import")
+IMPORT = App("record_import", _import, ImportSettings)

@@ -222,6 +222,8 @@ def varied(given: str, file: str) -> tuple[Named, Variation]:
         ConfigError: if it is not there, or is varied in a way that is not known.
     """
     name, *changes = given.split("@")
+    if not name:
+        raise ConfigError([f"subjects: {given!r}: names no policy before @, as paper{given} does"])
     variation = Variation()
     for change in changes:
         rate = re.fullmatch(r"(\d+(?:\.\d+)?)hz", change)

@@ -17,9 +17,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from go1exp.base.signals import STOPPED
+from go1exp.base.errors import FAILED, STOPPED
 from go1exp.cli import hydra_main
-from go1exp.cli.app import FAILED, App, spinner
+from go1exp.cli.app import App, spinner
 from go1exp.cli.verbs import command, quoted
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError

@@ -23,13 +23,14 @@ VERBS = {
     "list": "list terms, groups and their choices, one line each",
     "bench": "measure speed as ratios in one run",
 }
-"""Verb -> one line; the module has the verb's name (``list`` is ``listing``)."""
+"""Verb -> one line; the module has the verb's name or is in ``MODULES``."""
 
 MODULES = {
     "eval": "evaluate",
     "fit-actuator": "fit_actuator",
-    "list": "listing",
-    "sim": "simulate",
+    "list": "helptext",
+    "sim": "play_web",
+    "tune": "train",
     "record_audit": "record",
     "record_import": "record",
     "export_check": "export",

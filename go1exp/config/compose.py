@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from go1exp.config import hydra_adapter
-from go1exp.config.choices import FOLDERS, choice_files, config_folder
+from go1exp.config.choices import FOLDERS, choice_files, config_folder, groups_of
 from go1exp.config.schema.registry import ConfigError, nearest, unknown_name
 
 VALUE_PER_JOINT = re.compile(
@@ -56,7 +56,7 @@ def compose_checked(name: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
     """Compose as ``compose`` does, with the command line's messages; raise ConfigError if an override does not fit."""
     try:
         return compose(name, overrides)
-    except (*hydra_adapter.REFUSED, ValueError) as error:
+    except hydra_adapter.REFUSED as error:
         problem = composition_problem(error, name, overrides)
         if problem is None:
             raise
@@ -113,8 +113,16 @@ def _no_such_key(key: str, given: str, name: str, overrides: Sequence[str], fold
         known = [k for k in flat_keys(name, groups, folders) if k != key]
     except Exception:  # one of the others is wrong too
         known = [k for k in flat_keys(name) if k != key]
-    close = nearest(key, known) or nearest(key.rsplit(".", 1)[-1], known)
-    hint = f"did you mean {' or '.join(repr(c) for c in close)}?" if close else "see --help"
+    group, _, inside = key.partition(".")
+    choices = choice_files(group, [config_folder(), *folders]) if inside and group in groups_of(name) else {}
+    if choices and not any(k.startswith(f"{group}.") for k in known):
+        first = inside.partition(".")[0]
+        chosen = first if first in choices else "NAME"
+        return f"{given}: no such key {key!r}; no file of {group} is chosen, as {group}={chosen} does"
+    parent, _, last = key.rpartition(".")
+    ends = {k: k.rpartition(".")[2] for k in known} if parent else {}
+    close = nearest(key, known) or [k for k, end in ends.items() if nearest(last, [end])]
+    hint = f"did you mean {' or '.join(repr(c) for c in close[:3])}?" if close else "see --help"
     term, _, parameter = key.rpartition(".")
     others = [k.rpartition(".")[2] for k in known if k.startswith(f"{term}.")]
     if term.count(".") == 1 and others and given[0] not in "+~" and not nearest(parameter, others):

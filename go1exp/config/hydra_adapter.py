@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import pickle
 import re
+import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -30,16 +31,25 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, Override, RangeSweep
+from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.plugins.config_source import ConfigLoadError, ConfigResult
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.basecontainer import get_yaml_loader
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseException
 
-from go1exp.config.choices import FOLDERS, config_folder, folder_of, groups_of, hidden_from
+from go1exp.config.choices import (
+    FOLDERS,
+    UNREADABLE,
+    config_folder,
+    folder_of,
+    groups_of,
+    hidden_from,
+    why_unreadable,
+)
+from go1exp.config.schema.registry import ConfigError
 
 OLD = hydra.__version__ < "1.4"
 
@@ -48,7 +58,7 @@ MAIN: dict[str, Any] = (
 )
 """Arguments of ``hydra.main`` that depend on its version."""
 
-REFUSED = (HydraException, OmegaConfBaseException)
+REFUSED = (HydraException, OmegaConfBaseException, RecursionError, ValueError)
 """What composing raises where an override or a file does not fit."""
 
 GRAMMAR = re.compile(r"See https://hydra\.cc/docs/\S+/basic for details")
@@ -107,16 +117,14 @@ def _fast_loader() -> Any:
 @lru_cache(maxsize=1024)
 def _pickled(file: Path, mtime_ns: int, size: int) -> bytes:
     """Return a file's content and header, pickled, as long as the file does not change."""
-    text = file.read_text(encoding="utf-8")
     try:
+        text = file.read_text(encoding="utf-8")
         content = yaml.load(text, Loader=_fast_loader())
-    except yaml.YAMLError:
-        content = 0
-    config: Any
-    if content is None or isinstance(content, dict | list | str):
+        if content is not None and not isinstance(content, dict | list | str):
+            raise ConfigError([f"{file}: must be a mapping"])
         config = OmegaConf.create({} if content is None else content)
-    else:
-        config = OmegaConf.load(file)  # whose message shows the line that is wrong
+    except UNREADABLE as error:
+        raise ConfigError([f"{file}: {why_unreadable(error)}"]) from None
     return pickle.dumps((config, FileConfigSource._get_header_dict(text[:512])))
 
 
@@ -125,6 +133,8 @@ class VerbSource(FileConfigSource):
 
     hidden: ClassVar[frozenset[str]] = frozenset()
     """Folders that sources made from now on do not show."""
+    last: ClassVar[Path | None] = None
+    """File that was read last."""
 
     def __init__(self, provider: str, path: str) -> None:
         super().__init__(provider, path)
@@ -154,6 +164,7 @@ class VerbSource(FileConfigSource):
         file = Path(self.path, name).resolve()
         if not file.is_file():
             raise ConfigLoadError(f"Config not found : {file}")
+        VerbSource.last = file
         stamp = file.stat()
         config, header = pickle.loads(_pickled(file, stamp.st_mtime_ns, stamp.st_size))
         return ConfigResult(self.provider, f"{self.scheme()}://{self.path}", config, header)
@@ -310,13 +321,19 @@ def refusal(error: Exception, verb: str, overrides: Sequence[str], folders: Sequ
         return Refusal("choice", error.missing_cfg_file or "", str(error).split("\n")[0])
     if isinstance(error, OverrideParseException):
         return Refusal("grammar", error.override)
-    if not isinstance(error, (*REFUSED, ValueError)):
+    if isinstance(error, RecursionError):
+        in_defaults = any(f.filename.endswith("defaults_list.py") for f in traceback.extract_tb(error.__traceback__))
+        return Refusal("other", "", f"{VerbSource.last}: its defaults lead back to itself") if in_defaults else None
+    if not isinstance(error, REFUSED):
         return None
-    with suppress(*REFUSED, ValueError), hydra_for(verb, folders):
+    with suppress(*REFUSED), hydra_for(verb, folders):
         if culprit := _culprit(verb, overrides, tuple(folders)):
             return culprit
-    if isinstance(error, ValueError) and not isinstance(error, REFUSED):
+    if not isinstance(error, HydraException | OmegaConfBaseException):
         return None
+    if isinstance(error, InterpolationResolutionError):
+        why = str(error.msg or error).partition("while resolving interpolation: ")[2].partition("\n")[0].strip("'\"")
+        return Refusal("other", "", f"{error.full_key}: {why or str(error).partition(chr(10))[0]}")
     return Refusal("other", "", " ".join(GRAMMAR.sub("", str(error.__cause__ or error)).split()))
 
 
@@ -378,23 +395,3 @@ def jobs_of_sweep(config: DictConfig) -> list[list[str]] | None:
     listed = parser.parse_overrides([f"{key}={value}" for key, value in params.items()])
     parsed = [*(override for override in listed if override.key_or_group not in keys), *typed]
     return [job for batch in BasicSweeper.split_arguments(parsed, None) for job in batch]
-
-
-def sweep_range(text: str) -> tuple[str, dict[str, Any]]:
-    """Return key and range of an override in Hydra's grammar for sweeps: low, high, step, log; or choices.
-
-    Raises:
-        ValueError: if the text is no range of a key.
-    """
-    try:
-        (override,) = OverridesParser.create().parse_overrides([text])
-    except HydraException as error:
-        raise ValueError(text) from error
-    value = override.value()
-    if isinstance(value, IntervalSweep) and value.start is not None and value.end is not None:
-        return override.key_or_group, {"low": value.start, "high": value.end, "log": "log" in value.tags}
-    if isinstance(value, RangeSweep) and isinstance(value.start, int) and isinstance(value.stop, int):
-        return override.key_or_group, {"low": value.start, "high": value.stop - 1, "step": int(value.step)}
-    if isinstance(value, ChoiceSweep):
-        return override.key_or_group, {"choices": tuple(override.sweep_string_iterator())}
-    raise ValueError(text)

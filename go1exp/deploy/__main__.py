@@ -7,10 +7,8 @@ import sys
 from collections.abc import Sequence
 from functools import partial
 
-from go1exp.base.errors import Expected
-from go1exp.base.signals import STOPPED, handled, interrupt, say
-
-FAILED = 1
+from go1exp.base.errors import REFUSED, Expected, end
+from go1exp.base.signals import handled, interrupt
 
 
 def positive(text: str) -> float:
@@ -24,6 +22,14 @@ def positive(text: str) -> float:
 def not_negative(text: str) -> float:
     """Read a number of at least 0; raise argparse's error otherwise."""
     return 0.0 if float(text) == 0.0 else positive(text)
+
+
+def three(text: str) -> tuple[float, ...]:
+    """Read x,y,yaw; raise argparse's error otherwise."""
+    values = tuple(map(float, text.split(",")))
+    if len(values) != 3:
+        raise argparse.ArgumentTypeError(f"{text}: must be three numbers, such as 1,0.3,0.8")
+    return values
 
 
 TIMES = (
@@ -52,7 +58,7 @@ def arguments(given: Sequence[str]) -> argparse.Namespace:
     parser.add_argument(
         "--command", default="0,0,0", help="x,y,yaw (m/s, rad/s), FILE.csv, sinusoid, keyboard, gamepad"
     )
-    parser.add_argument("--amplitude", default="1,0.3,0.8", help="of the sinusoid")
+    parser.add_argument("--amplitude", type=three, default=(1.0, 0.3, 0.8), help="of the sinusoid, as x,y,yaw")
     parser.add_argument("--period", type=positive, default=10.0, help="of the sinusoid, s")
     for name, kind, meaning in TIMES:
         parser.add_argument(f"--{name.replace('_', '-')}", type=kind, default=getattr(Plan, name), help=meaning)
@@ -74,9 +80,8 @@ def main(given: Sequence[str]) -> int:
     try:
         with handled(interrupt):
             return _walk(arguments(given))
-    except KeyboardInterrupt:
-        say("go1exp.deploy: stopped")
-        return STOPPED
+    except (Exception, KeyboardInterrupt) as error:
+        return end(error, "go1exp.deploy")
 
 
 def _walk(options: argparse.Namespace) -> int:
@@ -84,21 +89,16 @@ def _walk(options: argparse.Namespace) -> int:
     from go1exp.deploy.runtime.job import Job, run_job
     from go1exp.deploy.runtime.walk import Plan
 
-    try:
-        amplitude = tuple(float(part) for part in options.amplitude.split(","))
-        command = CommandConfig(parsed(options.command), amplitude, options.period)
-        times = {name: getattr(options, name) for name, _, _ in TIMES}
-        plan = Plan(rate=options.rate, seconds=options.seconds, command=command, **times)
-        sim = {name: getattr(options, name) for name in ("start", "noise", "delay", "jitter", "loss", "seed")}
-        sim |= {"feet": options.foot_sensors}
-        if options.check:
-            return _check(options)
-        where = options.bundle, options.robot, plan, options.out, sim
-        job = Job(*where, truth=options.truth, address=options.address, feet=options.feet)
-        return run_job(job, partial(print, flush=True))
-    except (Expected, OSError, ValueError) as error:
-        print(f"go1exp.deploy: {error}", file=sys.stderr)
-        return FAILED
+    command = CommandConfig(parsed(options.command), options.amplitude, options.period)
+    times = {name: getattr(options, name) for name, _, _ in TIMES}
+    plan = Plan(rate=options.rate, seconds=options.seconds, command=command, **times)
+    sim = {name: getattr(options, name) for name in ("start", "noise", "delay", "jitter", "loss", "seed")}
+    sim |= {"feet": options.foot_sensors}
+    if options.check:
+        return _check(options)
+    where = options.bundle, options.robot, plan, options.out, sim
+    job = Job(*where, truth=options.truth, address=options.address, feet=options.feet)
+    return run_job(job, partial(print, flush=True))
 
 
 def _check(options: argparse.Namespace) -> int:
@@ -110,7 +110,7 @@ def _check(options: argparse.Namespace) -> int:
     from go1exp.deploy.runtime.job import run_check
 
     if options.robot != "go1":
-        raise ValueError(f"--check with --robot {options.robot}: is for --robot go1")
+        raise Expected(f"--check with --robot {options.robot}: is for --robot go1", status=REFUSED)
     about = load(options.bundle).metadata
     feet = Path(options.feet or Path(options.out) / "feet.json")
     return run_check(about.joints, np.array(about.joint_limits), feet, options.address, partial(print, flush=True))

@@ -192,9 +192,15 @@ def _steps(config: EvalConfig, dt: float) -> tuple[int, int]:
 
 def _refuse_too_long(config: EvalConfig, rate: float, count: int) -> None:
     """Raise TooLongError if ``rate`` B/s of what measures need of ``count`` robots do not fit into memory."""
-    if wrong := memory.too_long(config.duration_s - config.settle_s, rate):
-        what = f"what measures need of {counted(count, 'robot')}"
-        raise TooLongError([f"duration_s = {config.duration_s:g}: {what} {wrong}; measures=[] needs none of it"])
+    seconds, available = config.duration_s - config.settle_s, memory.free()
+    if available is None or seconds * rate <= available:
+        return
+    what = f"what measures need of {counted(count, 'robot')} {memory.too_much(seconds * rate, available)}"
+    fitting, key = f"{available / rate:.0f} s", f"duration_s = {config.duration_s:g}"
+    if rate > available:  # not one second would fit
+        fitting = str(int(config.episodes * available / (seconds * rate)))
+        key = f"episodes = {config.episodes}"
+    raise TooLongError([f"{key}: {what}; {fitting} at most would fit; measures=[] needs none of it"])
 
 
 def _agent(task: TaskConfig, policy: Policy | None, controller: Callable[[], Controller] | None) -> Agent:

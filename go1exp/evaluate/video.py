@@ -316,7 +316,9 @@ def _window(stage: Stage, on_key: Callable[[int], None]) -> Iterator[Any]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         if not glfw.init():
-            raise RenderingUnavailable(f"cannot open a window: the display {display!r} does not answer")
+            raise RenderingUnavailable(
+                f"cannot open a window: the display {display!r} does not answer; viewer=clip needs none"
+            )
     others = set(threading.enumerate())
     try:
         with launch_passive(

@@ -13,6 +13,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
+from go1exp.base.errors import REFUSED
 from go1exp.base.files import write_json
 from go1exp.config.schema.physics import ContactConfig, read_contact
 from go1exp.config.schema.registry import Expected
@@ -61,7 +62,7 @@ def load(folder: Path) -> GapResult:
     if folder.is_file():
         raise GapFileError(f"{folder}: is a file; out must be the folder of an answer, with {RESULT}")
     if not path.is_file():
-        raise GapFileError(f"{path}: no such file; run go1exp gap explain first")
+        raise GapFileError(f"{path}: no such file; run go1exp gap explain first", status=REFUSED)
     try:
         return from_dict(json.loads(path.read_text()))
     except (KeyError, TypeError, ValueError, AttributeError) as error:

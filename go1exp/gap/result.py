@@ -14,20 +14,11 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
 
+from go1exp.base.errors import EXIT_CODES as EXIT_CODES
 from go1exp.config.schema.physics import ContactConfig
 from go1exp.config.schema.registry import STRICT, Fraction, NonNegative, Positive
 
 Verdict = Literal["no gap", "explained", "partly explained", "unexplained", "not excited", "bad log"]
-
-EXIT_CODES: dict[str, int] = {
-    "no gap": 0,
-    "explained": 10,
-    "partly explained": 11,
-    "unexplained": 12,
-    "not excited": 13,
-    "bad log": 14,
-}
-"""Verdict -> exit code of the command."""
 
 Phase = Literal["auto", "whole", "swing"]
 """What of a robot that walks is compared: everything, or the legs that are in the air."""

@@ -33,6 +33,7 @@ import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from go1exp.base.errors import REFUSED
 from go1exp.base.files import opened
 from go1exp.base.wording import counted
 from go1exp.config.schema.physics import ContactConfig
@@ -303,7 +304,7 @@ def read(path: Path) -> Recording:
 
     path = Path(path)
     if not path.is_file():
-        raise RecordingError(f"{path}: no such file")
+        raise RecordingError(f"{path}: no such file", status=REFUSED)
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             text = (file.metadata.metadata or {}).get(KEY)
@@ -380,5 +381,7 @@ def read_folder(path: Path) -> list[Recording]:
     path = Path(path)
     files = sorted(path.glob("*.parquet"))
     if not files:
-        raise RecordingError(f"{path}: no *.parquet in it" if path.is_dir() else f"{path}: no such folder")
+        raise RecordingError(
+            f"{path}: no *.parquet in it" if path.is_dir() else f"{path}: no such folder", status=REFUSED
+        )
     return [read(file) for file in files]

@@ -28,6 +28,7 @@ from go1exp.config.schema.registry import (
     as_json,
     bind,
     explain,
+    one_of,
     unknown_name,
 )
 from go1exp.config.schema.training import BESIDE, EVALUATED, EvalDuring, Ramp, StopRule, VideoDuring
@@ -131,7 +132,7 @@ class ProcessConfig:
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     seed: Annotated[int, Field(ge=0, le=2**32 - 1)]
-    device: Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
+    device: Annotated[str, one_of(r"auto|cpu|cuda(:\d+)?", "auto, cpu, cuda, or one of several as cuda:1")]
     torch_threads: Annotated[int, Field(ge=0, le=1024)]
     resume: FolderName | None
     start_from: FolderName | None = None  # runs of older versions have none of these keys

@@ -150,13 +150,14 @@ def check_memory(config: TrainConfig, device: torch.device) -> None:
     """
     needed, available = needed_bytes(config), _available(device)
     if available is not None and needed > available:
+        ppo = config.ppo
+        beyond = {"num_envs": ppo.num_envs / 4096, "steps": ppo.steps / 24, "hidden": max(ppo.hidden) / 512}
+        first, *others = sorted(beyond, key=lambda name: -beyond[name])  # the one furthest beyond what is usual
+        values = {name: f"ppo.{name} = {getattr(ppo, name)}" for name in ("num_envs", "steps")}
+        values["hidden"] = f"ppo.hidden = {list(ppo.hidden)}"
         where = f"on {device}" if device.type == "cuda" else "in memory"
-        raise ConfigError(
-            [
-                f"ppo.num_envs = {config.ppo.num_envs}: with ppo.steps = {config.ppo.steps} it takes at least "
-                f"{needed / 1e9:.1f} GB, and {available / 1e9:.1f} GB are free {where}"
-            ]
-        )
+        amounts = f"at least {needed / 1e9:.1f} GB, and {available / 1e9:.1f} GB are free {where}"
+        raise ConfigError([f"{values[first]}: with {' and '.join(values[n] for n in others)} it takes {amounts}"])
 
 
 def _available(device: torch.device) -> int | None:

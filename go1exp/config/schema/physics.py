@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError
 
-from go1exp.config.schema.registry import Strict, as_json
+from go1exp.config.schema.registry import Strict, as_json, one_of
 
 
 class Engine(Strict):
@@ -60,7 +60,7 @@ class WarpBackend(Engine):
     """
 
     name: Literal["warp"]
-    device: Annotated[str, Field(pattern=r"^(cpu|cuda(:\d+)?)$")]
+    device: Annotated[str, one_of(r"cpu|cuda(:\d+)?", "cpu, cuda, or one of several as cuda:1")]
     graph: bool
     nconmax: Annotated[int, Field(ge=32, le=1000)]
     njmax: Annotated[int, Field(ge=64, le=2000)]

@@ -189,6 +189,18 @@ def in_force() -> list[Plugin]:
     return [*_active.values(), *(_installed or {}).values()]
 
 
+def blamed(error: BaseException) -> str | None:
+    """Return the term and line of a plugin that an error comes from, such as ``reward.slip (mine.py:12)``, or None."""
+    for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
+        module, code = str(frame.f_globals.get("__name__")), frame.f_code
+        plugin = next((p for p in in_force() if f"{module}.".startswith(f"{p.module}.")), None)
+        if plugin is not None:
+            term = code.co_qualname.partition(".")[0]
+            named = next((f"{e.group}.{e.name}" for e in plugin.entries if e.target.__qualname__ == term), code.co_name)
+            return f"{named} ({plugin.name if plugin.file else code.co_filename}:{line})"
+    return None
+
+
 # ---------------------------------------------------------------------- one plugin
 
 
@@ -284,6 +296,10 @@ def _import(module: str, name: str, file: Path | None) -> Plugin:
         raise ConfigError(
             [f"{KEY}: {name}: registers no term; decorate one, such as @reward('my_term') (go1exp.extend)"]
         )
+    if problems := [f"{KEY}: {name}: {e.group}.{e.name}: {why}" for e in entries if (why := e.untyped())]:
+        for entry in entries:
+            registry.remove(entry)
+        raise ConfigError(problems)
     _loaded[module] = Plugin(name, module, file, content, entries)
     return _loaded[module]
 

@@ -70,6 +70,17 @@ def within(low: float, high: float, unit: str) -> AfterValidator:
     return AfterValidator(check)
 
 
+def one_of(pattern: str, known: str) -> AfterValidator:
+    """Return a check that a text matches a pattern; the message has what is ``known``, such as cpu or cuda."""
+
+    def check(value: str) -> str:
+        if not re.fullmatch(pattern, value):
+            raise ValueError(f"must be {known}")
+        return value
+
+    return AfterValidator(check)
+
+
 Speed = Annotated[float, within(-100.0, 100.0, "(m/s or rad/s)")]
 """A velocity, m/s, or yaw rate, rad/s: no robot reaches the ends, and squares stay finite far beyond them."""
 SpeedRange = Annotated[tuple[Speed, Speed], AfterValidator(ordered)]
@@ -97,7 +108,7 @@ FolderName = Annotated[str, Field(min_length=1)]
 
 def nearest(name: str, known: Iterable[str], most: int = 3) -> list[str]:
     """Return up to ``most`` names of ``known`` that look like ``name``, best first."""
-    return difflib.get_close_matches(name, list(known), n=most, cutoff=0.5)
+    return difflib.get_close_matches(name, list(known), n=most, cutoff=0.6 if len(name) > 3 else 0.5)
 
 
 def unknown_name(path: str, name: str, known: Iterable[str], what: str) -> str:
@@ -213,6 +224,16 @@ class Entry:
             kind = get_type_hints(stub, globalns=dict(scope), include_extras=True)[name]
             fields[name] = (kind, ... if p.default is p.empty else p.default)
         return create_model(self.name, __config__=STRICT, **fields)
+
+    def untyped(self) -> str | None:
+        """Return what is wrong with the types of the parameters, of which the schema is made; None if nothing is."""
+        if bare := [name for name, p in self.parameters.items() if p.annotation is p.empty]:
+            return f"parameter {bare[0]!r} needs a type, such as {bare[0]}: float"
+        try:
+            self.schema  # noqa: B018  (made once)
+        except Exception as error:  # a name that is not known, a type that no YAML can give
+            return f"a parameter has no usable type ({str(error).strip().splitlines()[0]})"
+        return None
 
     def check(self, parameters: Mapping[str, Any], path: str) -> tuple[dict[str, Any], list[str]]:
         """Validate ``parameters``; return them with defaults filled in, and the problems."""

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from go1exp.base import signals
+from go1exp.base.errors import REFUSED
 from go1exp.deploy.estimation.feet import LEGS, FootCalibration
 from go1exp.deploy.runtime import bundle as bundles
 from go1exp.deploy.runtime.bundle import Bundle
@@ -91,7 +92,9 @@ def _connected(job: Job, bundle: Bundle, say: Say) -> Iterator[tuple[Go1Link, Si
             yield stack.enter_context(closing(Go1Link(HOST, process.port, SIMULATED_TICK_S))), process
         else:
             if not (job.robot.isascii() and job.robot.isdigit() and 0 < int(job.robot) < 2**16):
-                raise RobotError(f"robot={job.robot}: must be sim, go1, or the port where a simulated robot listens")
+                raise RobotError(
+                    f"robot={job.robot}: must be sim, go1, or the port where a simulated robot listens", status=REFUSED
+                )
             yield stack.enter_context(closing(Go1Link(HOST, int(job.robot), SIMULATED_TICK_S))), None
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from go1exp.base.errors import Expected
+from go1exp.base.errors import REFUSED, Expected
 
 PATIENCE = 120.0
 """Longest time for the robot's process to start, s: importing torch is slow on a busy machine."""
@@ -35,7 +35,7 @@ class RefusedError(RobotError):
 
     def __init__(self, problems: list[str]) -> None:
         """Set the problems."""
-        super().__init__("; ".join(problems))
+        super().__init__("; ".join(problems), status=REFUSED)
         self.problems = problems
 
 

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from go1exp.base.errors import REFUSED
 from go1exp.deploy.runtime import go1_wire
 from go1exp.deploy.runtime.launch import RobotError
 from go1exp.robot.go1_fields import PERIOD, ROBOT, ROBOT_PORT, STATE_SIZE
@@ -42,7 +43,7 @@ def parsed_address(text: str | None, default: tuple[str, int] = (ROBOT, ROBOT_PO
         return default
     host, colon, port = text.rpartition(":")
     if not (colon and host and port.isascii() and port.isdigit() and int(port) < 2**16):
-        raise RobotError(f"address={text}: must be HOST:PORT, such as {default[0]}:{default[1]}")
+        raise RobotError(f"address={text}: must be HOST:PORT, such as {default[0]}:{default[1]}", status=REFUSED)
     return host, int(port)
 
 

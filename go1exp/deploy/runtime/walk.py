@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from go1exp.base import signals
+from go1exp.base.errors import FAULTS, FIRST_FAULT, UNKNOWN_FAULT
 from go1exp.deploy.estimation.feet import FootCalibration
 from go1exp.deploy.runtime.bundle import Bundle
 from go1exp.deploy.runtime.commands import CommandConfig, Limited, make, range_array
@@ -22,15 +23,11 @@ from go1exp.deploy.runtime.controller import Controller, Cycle, Estimator, Mover
 from go1exp.deploy.runtime.estimate import BOTH, TORQUE, KalmanEstimator, NoEstimator, settings
 from go1exp.deploy.runtime.log import Log
 from go1exp.deploy.runtime.loop import MonotonicClock, Timing, run
-from go1exp.deploy.runtime.safety import RULES, Fault, Safety, SafetyConfig
+from go1exp.deploy.runtime.safety import Fault, Safety, SafetyConfig
 from go1exp.robot.messages import Link
 
-FAULTS = (*RULES, "no_state", "estimator", "command", "runtime")
-FIRST_STATUS = 20
-STATUS = {name: FIRST_STATUS + k for k, name in enumerate(FAULTS)}
+STATUS = {name: FIRST_FAULT + k for k, name in enumerate(FAULTS)}
 """Exit status of a walk that ended with a fault, by the fault's name."""
-
-UNKNOWN_FAULT = FIRST_STATUS - 1
 
 TIME = "the end of its time"
 

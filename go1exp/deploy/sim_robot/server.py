@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from go1exp.base.errors import REFUSED, Expected
 from go1exp.deploy.runtime import go1_wire
 from go1exp.deploy.runtime.loop import MonotonicClock, Timing, run
 from go1exp.deploy.runtime.safety import DEFAULT_KD
@@ -228,7 +229,7 @@ class Server:
         """Listen at ``port``, or at any that is free if 0; keep the newest ``kept`` s of truth and commands.
 
         Raises:
-            OSError: if the port is taken, or the host is not this machine's.
+            Expected: if the port is taken, or the host is not this machine's.
         """
         self.robot, self.packets = robot, Packets(config)
         rng = np.random.default_rng([config.seed, 1])
@@ -238,9 +239,9 @@ class Server:
         try:
             self._socket.bind((host, port))
             enable_timestamps(self._socket)
-        except OSError:
+        except OSError as error:
             self._socket.close()
-            raise
+            raise Expected(f"address = {host}:{port}: {error.strerror or error}", status=REFUSED) from None
         self.address: tuple[str, int] = self._socket.getsockname()
         self.peer: tuple[str, int] | None = None
         self._heard = -math.inf

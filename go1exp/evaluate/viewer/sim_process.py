@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from go1exp import robot
-from go1exp.base.errors import Expected
+from go1exp.base.errors import REFUSED, Expected
 from go1exp.base.signals import ending
 from go1exp.config.schema.registry import ConfigError
 from go1exp.deploy.sim_robot.alone import Say, posture
@@ -335,8 +335,8 @@ def _run(
     except ConfigError as error:
         pipe.send(Refused(tuple(error.problems), settings=True))
         return
-    except (Expected, OSError) as error:
-        pipe.send(Refused((f"address = {address[0]}:{address[1]}: {error}",), settings=False))
+    except Expected as error:
+        pipe.send(Refused((str(error),), settings=error.status == REFUSED))
         return
     pipe.send(server.address)
     answering = Answering(Probe(server, body, config), pipe)

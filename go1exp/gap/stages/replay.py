@@ -14,12 +14,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from go1exp.base.errors import EXIT_CODES
 from go1exp.base.tensors.threads import one_thread
 from go1exp.gap.comparison import Comparison, NotComparable, Progress, compare, robot_from
 from go1exp.gap.data.cutting import even_clock, noise_of
 from go1exp.gap.data.standing import AXES, rows_at
 from go1exp.gap.replay.rows import Rows, variants
-from go1exp.gap.result import EXIT_CODES, GapSettings
+from go1exp.gap.result import GapSettings
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score.initial_state import solved
 from go1exp.gap.score.likelihood import Scorer, excess

@@ -23,6 +23,7 @@ import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from go1exp.base.errors import REFUSED
 from go1exp.base.files import opened, write_bytes
 from go1exp.config.schema.registry import STRICT, Expected, NonNegative, Positive, explain
 
@@ -275,7 +276,7 @@ def load(path: Path) -> ActuatorNet:
     """
     path = Path(path)
     if not path.is_file():
-        raise NetFileError(f"{path}: no such file")
+        raise NetFileError(f"{path}: no such file", status=REFUSED)
     try:
         with path.open("rb") as file:
             archive = np.load(file, allow_pickle=False)

@@ -238,6 +238,8 @@ class StepTerms:
         Raises:
             ConfigError: if not. One number for all robots would be spread over them without a word.
         """
+        if not isinstance(value, Tensor):
+            raise ConfigError([f"{group}.{term.key}: gives {type(value).__name__}, must be a tensor"])
         size = (frame_width(term),) if group == "observation" else ()
         if value.shape == (self.values.shape[0], *size):
             return value

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import mujoco
 
+from go1exp.base.errors import REFUSED
 from go1exp.config.schema.registry import Expected
 from go1exp.robot import MOUNT
 from go1exp.sim.physics.scene import RIGID, add_mount
@@ -47,7 +48,7 @@ def build_fixed_base(
             two of them in one link.
     """
     if not file.is_file():
-        raise FixedBaseError(f"mjcf = {str(file)!r}: no such file")
+        raise FixedBaseError(f"mjcf = {str(file)!r}: no such file", status=REFUSED)
     try:
         spec = mujoco.MjSpec.from_file(str(file))
     except ValueError as error:
