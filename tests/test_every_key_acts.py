@@ -34,19 +34,9 @@ from mujoco.batch import Batch
 from omegaconf import OmegaConf
 
 from go1exp.base.paths import data_root
-from go1exp.cli.app import App
+from go1exp.cli.app import app_of
 from go1exp.cli.app import parse as parsed
-from go1exp.cli.bench import BenchSettings
-from go1exp.cli.deploy import DeploySettings
-from go1exp.cli.evaluate import EvalSettings
-from go1exp.cli.export import ExportCheckSettings, ExportSettings
-from go1exp.cli.fit_actuator import FitActuatorSettings
-from go1exp.cli.gap import GapVerb
-from go1exp.cli.helptext import ListSettings
-from go1exp.cli.play import PlaySettings
-from go1exp.cli.play_web import BODY
-from go1exp.cli.record import RIG, AuditSettings, ImportSettings, RecordSettings
-from go1exp.cli.subjects import ROBOT_GROUPS
+from go1exp.cli.record import RIG
 from go1exp.config import compose as composing
 from go1exp.config.schema import registry
 from go1exp.config.schema.registry import ConfigError, Expected, Range
@@ -57,7 +47,6 @@ from go1exp.deploy.export.graph import DeployedPolicy
 from go1exp.deploy.runtime import go1_wire
 from go1exp.deploy.runtime.bundle import loads
 from go1exp.deploy.runtime.walk import STATUS
-from go1exp.deploy.sim_robot.settings import SimSettings
 from go1exp.mdp.types import Snapshot
 from go1exp.robot.messages import LowCmd
 from go1exp.sim.env.core import Go1Core
@@ -441,26 +430,13 @@ def parse(program: str, container: dict[str, Any]) -> Any:
         _, problems = parse_parts(container, RIG)
         if problems:
             raise ConfigError(problems)
-    kind, elsewhere = SETTINGS[program]
-    return parsed(kind, {k: v for k, v in container.items() if k not in (*elsewhere, "plugins")})
+    kind = settings_of(program)
+    return parsed(kind, {f.name: container[f.name] for f in fields(kind) if f.name in container})
 
 
-SETTINGS: dict[str, tuple[type, tuple[str, ...]]] = {
-    "eval": (EvalSettings, ("engine", "protocol")),
-    "play": (PlaySettings, ("engine",)),
-    "record": (RecordSettings, (*RIG, "excitation")),
-    "record_audit": (AuditSettings, ()),
-    "record_import": (ImportSettings, ()),
-    "fit-actuator": (FitActuatorSettings, ("robot",)),
-    "gap": (GapVerb, ("robot", "model")),
-    "export": (ExportSettings, ()),
-    "export_check": (ExportCheckSettings, ()),
-    "deploy": (DeploySettings, ROBOT_GROUPS),
-    "sim": (SimSettings, BODY),
-    "list": (ListSettings, ()),
-    "bench": (BenchSettings, ()),
-}
-"""Program -> its schema, and the keys that are checked elsewhere."""
+def settings_of(program: str) -> Any:
+    """The class of a verb's settings that are no group's."""
+    return app_of(program).settings
 
 
 def complaints(program: str, container: dict[str, Any]) -> list[str]:
@@ -871,7 +847,7 @@ def verb_trace(container: dict[str, Any], walk: Walk) -> Trace:
 
 
 def outcome(
-    app: App, container: dict[str, Any], walk: Walk, statuses: tuple[int, ...] = (0,)
+    program: str, container: dict[str, Any], walk: Walk, statuses: tuple[int, ...] = (0,)
 ) -> tuple[str, dict[str, bytes]]:
     """Run a verb without its Hydra application; return what it printed, and the files it wrote by path."""
     said, here = io.StringIO(), walk.folder()
@@ -879,7 +855,7 @@ def outcome(
     before = {p for place in places for p in place.rglob("*")}
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(said):
         patch.chdir(here)
-        status = app.task(container) or 0
+        status = app_of(program).task(container) or 0
     assert status in statuses
     files = {p: place for place in places for p in place.rglob("*") if p not in before and p.is_file()}
     written = {p.relative_to(place).as_posix(): p.read_bytes() for p, place in files.items()}
@@ -890,9 +866,8 @@ def outcome(
 
 def eval_trace(container: dict[str, Any], walk: Walk) -> Trace:
     """The report without the settings that it repeats, and where it lies."""
-    from go1exp.cli.evaluate import APP
 
-    _, files = outcome(APP, container, walk)
+    _, files = outcome("eval", container, walk)
     yield "files", sorted(files)
     for name, content in files.items():
         if name.endswith(".parquet"):  # rows of what the report has
@@ -903,7 +878,6 @@ def eval_trace(container: dict[str, Any], walk: Walk) -> Trace:
 
 def play_trace(container: dict[str, Any], walk: Walk) -> Trace:
     """The frames of the film, or that the live viewer was opened; a stub draws the state as numbers."""
-    from go1exp.cli.play import APP
     from go1exp.evaluate import video
 
     seen: list[Any] = []
@@ -929,19 +903,18 @@ def play_trace(container: dict[str, Any], walk: Walk) -> Trace:
         patch.setattr(video, "write_mp4", write_mp4)
         patch.setattr(video, "write_strip", lambda path, frames: path.write_text("strip"))
         patch.setattr(video, "live", lambda core, policy: seen.append("live"))
-        _, files = outcome(APP, container, walk)
+        _, files = outcome("play", container, walk)
     yield "frames", seen
     yield "files", files
 
 
 def record_trace(container: dict[str, Any], walk: Walk) -> Trace:
     """Where the recordings lie and what their channels hold; their names and metadata repeat the settings."""
-    from go1exp.cli.record import APP
     from go1exp.logs.record import simulate
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulate, "SETTLE_S", 0.02)
-        _, files = outcome(APP, container, walk)
+        _, files = outcome("record", container, walk)
     yield from recorded(files)
 
 
@@ -955,17 +928,15 @@ def recorded(files: Mapping[str, bytes]) -> Trace:
 def audit_trace(container: dict[str, Any], walk: Walk) -> Trace:
     """What is said of the recordings, without their names, and where it is written."""
     from go1exp.base.errors import AUDIT as STATUSES
-    from go1exp.cli.record import AUDIT
 
-    said, files = outcome(AUDIT, container, walk, tuple(STATUSES.values()))
+    said, files = outcome("record_audit", container, walk, tuple(STATUSES.values()))
     yield "findings", [line for line in said.splitlines() if ".parquet" not in line and "written to" not in line]
     yield "files", sorted(files)
 
 
 def import_trace(container: dict[str, Any], walk: Walk) -> Trace:
-    from go1exp.cli.record import IMPORT as APP
 
-    yield from recorded(outcome(APP, container, walk)[1])
+    yield from recorded(outcome("record_import", container, walk)[1])
 
 
 def fit_trace(container: dict[str, Any], walk: Walk) -> Trace:
@@ -982,7 +953,7 @@ def fit_trace(container: dict[str, Any], walk: Walk) -> Trace:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fitting, "plot", plot)
         patch.setattr(fit_actuator, "spinner", lambda total, what: lambda done, total: epochs.append(done))
-        _, files = outcome(fit_actuator.APP, container, walk)
+        _, files = outcome("fit-actuator", container, walk)
     yield "files", sorted(files)
     found = {Path(name).name: content for name, content in files.items()}
     report = json.loads(found["report.json"])
@@ -999,8 +970,7 @@ def gap_trace(container: dict[str, Any], walk: Walk) -> Trace:
     Two effects are all that the library has here, and one of them all that the nominal model may vary: the search is
     the whole one, but a replay has ten variants and not sixty.
     """
-    from go1exp.cli.gap import APP, DOES_NOT_HOLD
-    from go1exp.gap.result import EXIT_CODES
+    from go1exp.base.errors import DOES_NOT_HOLD, EXIT_CODES
     from go1exp.gap.robots import go1
     from go1exp.gap.search import tolerances
 
@@ -1014,7 +984,7 @@ def gap_trace(container: dict[str, Any], walk: Walk) -> Trace:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tolerances, "nominal", lambda robot: ("viscous",))
         patch.setattr(go1, "MujocoCpu", backend)
-        _, files = outcome(APP, few, walk, (*EXIT_CODES.values(), DOES_NOT_HOLD))
+        _, files = outcome("gap", few, walk, (*EXIT_CODES.values(), DOES_NOT_HOLD))
     yield "files", sorted(files)
     yield "batches", sorted(built)
     for name, content in sorted(files.items()):
@@ -1030,9 +1000,8 @@ def gap_trace(container: dict[str, Any], walk: Walk) -> Trace:
 
 def export_trace(container: dict[str, Any], walk: Walk) -> Trace:
     """The policy, what it is said to be, and its trace; not the configuration that goes with them."""
-    from go1exp.cli.export import APP
 
-    _, files = outcome(APP, container, walk)
+    _, files = outcome("export", container, walk)
     yield "files", sorted(files)
     for content in files.values():
         found = loads(content, "bundle")
@@ -1042,9 +1011,8 @@ def export_trace(container: dict[str, Any], walk: Walk) -> Trace:
 
 def check_trace(container: dict[str, Any], walk: Walk) -> Trace:
     """What is said of the policy, without the file's name."""
-    from go1exp.cli.export import CHECK as APP
 
-    said, _ = outcome(APP, container, walk)
+    said, _ = outcome("export_check", container, walk)
     yield "said", [re.sub(r"\S+\.zip", "", line) for line in said.splitlines()]
 
 
@@ -1053,13 +1021,12 @@ def deploy_trace(container: dict[str, Any], walk: Walk) -> Trace:
 
     What its drives were told, cycle by cycle, and what was logged, but for the account, which repeats settings.
     """
-    from go1exp.cli.deploy import APP
 
     for silent_from in (np.inf, 0.08, 0.0):
         refused, files = "", dict[str, bytes]()
         with lockstep(lambda state, begin=silent_from: state if state.clock < begin else None) as world:  # type: ignore[misc]
             try:
-                _, files = outcome(APP, container, walk, (0, *STATUS.values()))
+                _, files = outcome("deploy", container, walk, (0, *STATUS.values()))
             except Expected as error:
                 refused = str(error)
         if refused:
@@ -1077,7 +1044,6 @@ def deploy_trace(container: dict[str, Any], walk: Walk) -> Trace:
 
 def sim_trace(container: dict[str, Any], walk: Walk) -> Trace:
     """What a client that moves a leg hears, and where the robot truly is, tick by tick."""
-    from go1exp.cli.play_web import SIM as APP
     from go1exp.deploy.sim_robot import alone
 
     seen: list[Any] = []
@@ -1097,19 +1063,17 @@ def sim_trace(container: dict[str, Any], walk: Walk) -> Trace:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(alone, "serve", lived)
-        outcome(APP, container, walk)
+        outcome("sim", container, walk)
     yield from (("lived", part) for part in seen)
 
 
 def list_trace(container: dict[str, Any], walk: Walk) -> Trace:
-    from go1exp.cli.helptext import APP
 
-    yield "output", outcome(APP, container, walk)[0]
+    yield "output", outcome("list", container, walk)[0]
 
 
 def bench_trace(container: dict[str, Any], walk: Walk) -> Trace:
     """What is built and for how long it runs, by a clock of its own and without other processes."""
-    from go1exp.cli.bench import APP
     from go1exp.evaluate.bench import env
     from go1exp.sim.physics import mujoco_cpu
 
@@ -1131,7 +1095,7 @@ def bench_trace(container: dict[str, Any], walk: Walk) -> Trace:
         patch.setattr(env, "Batch", batch)
         patch.setattr(env, "subproc_subject", lambda task: (env.Subject("processes", lambda: 1), lambda: None))
         patch.setattr(env, "memory_per_env_kb", memory)
-        said, files = outcome(APP, container, walk)
+        said, files = outcome("bench", container, walk)
     yield "built", built
     yield "time", next(ticks)
     yield "figures", re.findall(r"^ *[\d,.]+  .*", said, re.MULTILINE)
@@ -1226,7 +1190,7 @@ def marks(leaf: Leaf) -> list[pytest.MarkDecorator]:
 
 
 READ: dict[str, list[type]] = {
-    **{program: [kind] for program, (kind, _) in SETTINGS.items() if program in SLOW},
+    **{program: [settings_of(program)] for program in SMALL if program in SLOW},
     "ppo/paper": [PPOConfig, LoggerConfig, CheckpointConfig],
 }
 """A file of a program or group -> the dataclasses of its settings."""

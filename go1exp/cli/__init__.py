@@ -18,8 +18,8 @@ from go1exp.cli.verbs import MODULES as MODULES
 from go1exp.cli.verbs import ONE_BLAS_THREAD as ONE_BLAS_THREAD
 from go1exp.cli.verbs import POSITIONAL as POSITIONAL
 from go1exp.cli.verbs import SUBVERBS as SUBVERBS
-from go1exp.cli.verbs import VALUED as VALUED
 from go1exp.cli.verbs import VERBS as VERBS
+from go1exp.cli.verbs import parted, quoted
 
 HELP = """usage: go1exp VERB [key=value ...]
 
@@ -137,21 +137,9 @@ def _by_name(verb: str, arguments: list[str]) -> list[str]:
 
     Options come first: Hydra's parser takes none between overrides.
     """
-    from go1exp.cli.verbs import quoted
-
-    keys = list(POSITIONAL.get(verb, ()))
-    words: list[str] = []
-    options: list[str] = []
-    settings: list[str] = []
-    for before, word in zip(["", *arguments], arguments, strict=False):
-        if word.startswith("-") or before in VALUED:
-            options.append(word)
-        elif "=" in word or word.startswith("~") or not keys:
-            settings.append(word)
-        else:
-            words.append(word)
+    options, settings, words = parted(arguments)
     named = []
-    for key in keys:
+    for key in POSITIONAL.get(verb, ()):
         if key in LISTS and words:
             return [*options, *settings, f"{key}=[{','.join(quoted(w) for w in words)}]"]
         if words:

@@ -15,7 +15,7 @@ from typing import Any
 
 from go1exp.base.errors import REFUSED, Expected
 from go1exp.base.paths import data_root
-from go1exp.cli.verbs import POSITIONAL, SUBVERBS, VALUED, VERBS
+from go1exp.cli.verbs import POSITIONAL, SUBVERBS, VERBS, parted
 from go1exp.config.choices import CONFIG_DIR, choice_files, config_folder, given_folders, groups_in, groups_of, load
 
 OPTIONS = ("--help", "--cfg", "--multirun", "--config-dir", "--resolve", "--package", "--info")
@@ -172,10 +172,7 @@ def _as_bash_inserts_them(words: Sequence[str], line: str, breaks: str) -> list[
 def _by_position(verb: str, word: str, before: Sequence[str], folders: Sequence[Path]) -> list[str]:
     """Complete a word that is given by position alone."""
     keys = POSITIONAL.get(verb, ())
-    place = sum(
-        "=" not in given and not given.startswith(("-", "~")) and option not in VALUED
-        for option, given in zip(["", *before], before, strict=False)
-    )
+    place = len(parted(before)[2])
     if not keys or (place >= len(keys) and keys != ("files",)):
         return []
     key = keys[min(place, len(keys) - 1)]

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from go1exp.cli.app import MEANING, App, app_of, parse
 from go1exp.cli.hydra_main import choices_from_files
-from go1exp.cli.verbs import LISTS, POSITIONAL, SUBVERBS, VALUED
+from go1exp.cli.verbs import LISTS, POSITIONAL, SUBVERBS, parted
 from go1exp.config.choices import about, choice_files, config_folder, given_folders, groups_in, groups_of, load
 from go1exp.config.compose import compose
 from go1exp.config.hydra_adapter import shown_folders
@@ -45,7 +45,7 @@ def show(verb: str, arguments: Sequence[str]) -> None:
     Raises:
         ConfigError: if a word among them names nothing that there is help for.
     """
-    words, title = _words(arguments), f"go1exp {verb.replace('_', ' ')}"
+    words, title = parted(arguments)[2], f"go1exp {verb.replace('_', ' ')}"
     if subverb := next((word for word in words if word in SUBVERBS.get(verb, ())), None):
         show(f"{verb}_{subverb}", [word for word in arguments if word != subverb])
         return
@@ -62,15 +62,6 @@ def show(verb: str, arguments: Sequence[str]) -> None:
         raise ConfigError([f"no group or key {strange[-1]!r}; {hint}"])
     named = next((group for word in words if (group := word.partition(".")[0]) in groups), None)
     print("\n".join(_group_page(title, named, groups, container, folders) if named else _page(verb, title, container)))
-
-
-def _words(arguments: Sequence[str]) -> list[str]:
-    """Return the words that are no option, no option's value and no override."""
-    return [
-        word
-        for before, word in zip(["", *arguments], arguments, strict=False)
-        if before not in VALUED and not word.startswith(("-", "~")) and "=" not in word
-    ]
 
 
 def _composed(verb: str, arguments: Sequence[str], folders: Sequence[Path]) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +87,18 @@ FILE_OF_COMMANDS = re.compile(r"command=.*\.csv$")
 
 _MEANT_FOR_HYDRA = re.compile(r"""$|null$|['"\[{]|.*\$\{|\w+\(.*\)$""")
 """A value with quotes of its own, a list, an interpolation, a function such as ``glob(*)``."""
+
+
+def parted(arguments: Sequence[str]) -> tuple[list[str], list[str], list[str]]:
+    """Return options with their values, overrides, and other words."""
+    options: list[str] = []
+    overrides: list[str] = []
+    words: list[str] = []
+    for before, word in zip(["", *arguments], arguments, strict=False):
+        is_option = word.startswith("-") or before in VALUED
+        is_override = "=" in word or word.startswith("~")
+        (options if is_option else overrides if is_override else words).append(word)
+    return options, overrides, words
 
 
 def quoted(text: str) -> str:
