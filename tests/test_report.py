@@ -474,8 +474,6 @@ def test_runs_of_other_tasks_and_a_missing_term_are_named(tmp_path: Path) -> Non
     got = made(tmp_path)
     assert any("no reward.gait" in g.name for g in got.groups)
     assert "training commands differ, so that returns and lengths are of different tasks" in got.study.notes
-    with pytest.raises(ConfigError, match="unknown figure 'nosuch'"):
-        made(tmp_path, figures=("nosuch",))
 
 
 # ---------------------------------------------------------------------- files

@@ -8,10 +8,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-
 from go1exp.config.schema.registry import Term, members
-from go1exp.evaluate.bench.env import core_subject, rates, ratio
+from go1exp.evaluate.bench.env import core_subject, rates, ratio, speeds
 from go1exp.gap.actuator_net.fitting import fit
 from go1exp.gap.actuator_net.settings import FitSettings
 from go1exp.logs import recording
@@ -74,7 +72,7 @@ def run(
         measured = rates(subjects, rounds, seconds, on_round)
         recorded = record_seconds(rig, sensors, folder)
     return {
-        **{f"{key}_steps_per_s": float(np.median(values)) for key, values in measured.items()},
+        **speeds(measured),
         "net_over_pd": ratio(measured, "net", "pd"),
         "effects_over_none": ratio(measured, "effects", "pd"),
         "record_s": recorded,

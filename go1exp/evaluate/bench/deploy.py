@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import timeit
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -87,12 +88,7 @@ def _jitter(idle: Timing) -> dict[str, float]:
 def _policy(bundle: Bundle) -> float:
     """Return the time of one call of the policy, us: the median."""
     readings = {port.name: np.zeros((1, port.size), np.float32) for port in bundle.policy.inputs}
-    times = []
-    for _ in range(CALLS):
-        start = time.perf_counter()
-        bundle.policy(readings)
-        times.append(time.perf_counter() - start)
-    return 1e6 * float(np.median(times))
+    return _median_us(lambda: bundle.policy(readings))
 
 
 def _packets() -> float:
@@ -104,35 +100,27 @@ def _packets() -> float:
     state = LowState(0.0, q, qd, torque, quat, np.zeros(3), np.zeros(3), np.full(4, 30.0))
     health, rpy = Health(), np.zeros(3)
     packet = pack_state(state, 2, health, rpy)
-    times = []
-    for _ in range(CALLS):
-        start = time.perf_counter()
+
+    def both_ends() -> None:
         unpack_command(pack_command(command))
         pack_state(state, 2, health, rpy)
         if state_refusal(packet) is None:
             tick_of(packet)
             unpack_state(packet, 0.0, 0.0)
-        times.append(time.perf_counter() - start)
-    return 1e6 * float(np.median(times))
+
+    return _median_us(both_ends)
+
+
+def _median_us(work: Callable[[], object]) -> float:
+    return 1e6 * float(np.median(timeit.repeat(work, number=1, repeat=CALLS)))
 
 
 def _walk(file: Path, seconds: float, out: Path) -> dict[str, float]:
     """Walk once; return figures from the runtime's report."""
-    arguments = [str(file), "--rate", str(RATE), "--seconds", str(seconds), "--stand-up", "0.2", "--brake", "0.1"]
+    times = ["--rate", str(RATE), "--seconds", str(seconds), "--stand-up", "0.2", "--brake", "0.1", "--stale", "5"]
     with SimulatedRobot(str(file), {}, {}) as robot:
         done = subprocess.run(
-            [
-                sys.executable,
-                "-m",
-                "go1exp.deploy",
-                *arguments,
-                "--robot",
-                str(robot.port),
-                "--stale",
-                "5",
-                "--out",
-                str(out),
-            ],
+            [sys.executable, "-m", "go1exp.deploy", str(file), *times, "--robot", str(robot.port), "--out", str(out)],
             env={**os.environ, "OMP_NUM_THREADS": "1"},
             capture_output=True,
             text=True,

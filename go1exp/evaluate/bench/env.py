@@ -66,6 +66,11 @@ def ratio(rates: Mapping[str, list[float]], over: str, under: str) -> float:
     return statistics.median(a / b for a, b in zip(rates[over], rates[under], strict=True))
 
 
+def speeds(rates: Mapping[str, list[float]]) -> dict[str, float]:
+    """Return the median over rounds of each subject's rate, by the figure's name."""
+    return {f"{name}_steps_per_s": statistics.median(values) for name, values in rates.items()}
+
+
 def machine() -> str:
     """Describe the machine and the versions that matter, one line."""
     cpu = platform.processor() or platform.machine()
@@ -192,9 +197,7 @@ def run(
     finally:
         close()
     return {
-        "env_steps_per_s": float(np.median(measured["env"])),
-        "bare_steps_per_s": float(np.median(measured["bare"])),
-        "subproc_steps_per_s": float(np.median(measured["subproc"])),
+        **speeds(measured),
         "env_over_bare": ratio(measured, "env", "bare"),
         "env_over_subproc": ratio(measured, "env", "subproc"),
         "memory_per_env_kb": memory_per_env_kb(overrides),
@@ -223,8 +226,4 @@ def train(
         "env": core_subject(config.task, num_envs),
     }
     measured = rates(subjects, rounds, seconds, on_round)
-    return {
-        "train_steps_per_s": float(np.median(measured["train"])),
-        "env_steps_per_s": float(np.median(measured["env"])),
-        "train_over_env": ratio(measured, "train", "env"),
-    }
+    return {**speeds(measured), "train_over_env": ratio(measured, "train", "env")}

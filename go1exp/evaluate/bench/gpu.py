@@ -11,13 +11,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from go1exp import robot
 from go1exp.config.schema.joint_values import spread
 from go1exp.config.schema.registry import ConfigError, Term, members
-from go1exp.evaluate.bench.env import ACTION_SCALE, Subject, learning, rates, ratio
+from go1exp.evaluate.bench.env import ACTION_SCALE, Subject, learning, rates, ratio, speeds
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.engine import make_backend
 from go1exp.sim.env.sb3_env import Go1VecEnv
@@ -153,7 +152,7 @@ def run(
     subjects |= {"train": training, "numpy": border_subject(config)}
     measured = rates(subjects, rounds, seconds, on_round)
     cold, warm = first_update_seconds([*overrides, f"ppo.num_envs={num_envs}"])
-    speed = {f"{name}_steps_per_s": float(np.median(values)) for name, values in measured.items()}
+    speed = speeds(measured)
     with_net = {"gpu_net_over_bare": ratio(measured, "net", "bare")} if net is not None else {}
     return {
         **speed,
