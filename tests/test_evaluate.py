@@ -22,8 +22,10 @@ from go1exp.evaluate.agents import columns
 from go1exp.evaluate.recorder import Recorder
 from go1exp.evaluate.rollout import EvalConfig, delay_margin, delayed, evaluate, evaluation_task, grid
 from go1exp.mdp.measures import every_measure
+from go1exp.mdp.types import Snapshot
 from go1exp.robot import GRAVITY
 from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.terms import StepTerms
 from go1exp.sim.task import TaskConfig, TrainConfig, parse_train
 from go1exp.train import checkpoint, run_folder, trainer
 from go1exp.train.policy import Policy, load_policy
@@ -179,10 +181,13 @@ def test_a_fall_ends_the_counting(task: TaskConfig) -> None:
 
 
 def test_leaving_the_map_ends_the_counting_and_is_no_fall(task: TaskConfig, monkeypatch: pytest.MonkeyPatch) -> None:
-    def off_map(core: Go1Core) -> Tensor:
-        return torch.tensor([True, False]) & (core.steps == 10)
+    steps = [0]
 
-    monkeypatch.setattr(Go1Core, "_off_map", off_map)
+    def cut_short(terms: StepTerms, left_map: Tensor, s: Snapshot) -> Tensor:
+        steps[0] += 1
+        return torch.tensor([steps[0] == 10, False])
+
+    monkeypatch.setattr(StepTerms, "cut_short", cut_short)
     (row,) = evaluate(task, stand, settings(duration_s=1.0))["commands"]
     assert row["falls"] == 0
     assert row["mean_time_s"] == pytest.approx((9 * 0.02 + 1.0) / 2, abs=1e-4)
