@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import mujoco
 import pytest
 
 from go1exp.sim.physics.fixed_base import FixedBaseError, build_fixed_base
@@ -30,3 +31,18 @@ def test_a_mesh_that_is_missing_is_named_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(FixedBaseError, match=r"^mjcf = .*arm\.urdf.*link\.stl") as caught:
         build_fixed_base(tmp_path / "arm.urdf", "base_link", ["arm"], [2.0], 0.001)
     assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_link_whose_mass_lies_on_its_joint_takes_another_mass(tmp_path: Path) -> None:
+    """MuJoCo calls such a body simple, and refuses to move its centre of mass afterwards."""
+    text = """<mujoco><worldbody><body name="stand"><inertial mass="1" pos="0 0 0" diaginertia="1e-3 1e-3 1e-3"/>
+      <body name="arm"><joint name="arm" axis="0 0 1"/>
+        <inertial mass="0.1" pos="0 0 0" diaginertia="1e-2 1e-2 1e-2"/></body></body></worldbody></mujoco>"""
+    (tmp_path / "arm.xml").write_text(text)
+    model = build_fixed_base(tmp_path / "arm.xml", "stand", ["arm"], [2.0], 0.001)
+    assert model.body_simple[model.body("arm").id] == 0
+    model.body("arm").ipos[:] = [0.05, 0.0, 0.0]
+    data = mujoco.MjData(model)
+    mujoco.mj_setConst(model, data)
+    mujoco.mj_forward(model, data)
+    assert data.M[0] == pytest.approx(1e-2 + 0.1 * 0.05**2)

@@ -14,7 +14,7 @@ from go1exp.gap.answer import Answer, bounded_joints, weak_joints
 from go1exp.gap.report.words import sentence
 from go1exp.gap.result import Candidate, GapSettings, NamedEffect
 from go1exp.gap.search.candidates import Trial
-from go1exp.gap.search.certainty import beside_a_gap, doubt, widened
+from go1exp.gap.search.certainty import beside_a_gap, doubt, spanned, widened
 from go1exp.gap.search.state import LastCheck, Search
 from go1exp.sim.effects.tolerances import DECLARED, declared
 
@@ -232,3 +232,14 @@ def test_joints_on_a_bound_are_doubted_unless_all_are(scale: tuple[float, ...], 
     assert (p.low, p.high) == (0.5, 2.0)
     asked: Any = Stub()
     assert bounded_joints(asked, "link_mass", {("link_mass", "scale"): np.array(scale)}) == joints
+
+
+def test_strength_acts_as_both_gains_together_and_as_neither_alone() -> None:
+    columns = np.random.default_rng(0).normal(size=(500, 3)) * [1.0, 0.1, 7.0]  # of kp, of kd, of something else
+    columns = np.column_stack([columns, 1.2 * columns[:, 0] - 3.0 * columns[:, 1]])
+    matrix = columns.T @ columns
+    assert spanned(matrix, 3, np.array([0, 1]))
+    assert spanned(matrix, 0, np.array([1, 3]))
+    assert not spanned(matrix, 3, np.array([0]))
+    assert not spanned(matrix, 2, np.array([0, 1, 3]))
+    assert not spanned(matrix, 3, np.array([], dtype=int))

@@ -414,7 +414,7 @@ def test_the_command_seals_writes_and_continues(
     removed.rmdir()
     generate.main([*words, f"signals={signals}"])
     assert (removed / "episode_00.parquet").read_bytes() == before
-    assert json.loads((signals / f"{removed.name}.json").read_text())["signal"] >= 0
+    assert json.loads((signals / f"{removed.name}.json").read_text())["signal"] > 0.01  # in noises of the angles
     with pytest.raises(SystemExit, match="other settings"):
         generate.main([*words[:3], "seed=5", *words[4:]])
 

@@ -31,7 +31,7 @@ from go1exp.gap.stages.apply import prove, write
 from go1exp.gap.stages.explain import explain
 from go1exp.logs.recording import Recording
 from go1exp.robot import JOINTS
-from go1exp.sim.effects.tolerances import DECLARED, Tolerances, declared, sizes
+from go1exp.sim.effects.tolerances import DECLARED, Tolerances, declared, problems, sizes
 from go1exp.sim.task import parse_parts
 from tests.laboratory import recorded
 
@@ -217,3 +217,12 @@ def test_friction_that_is_within_the_users_tolerance_is_no_gap(monkeypatch: pyte
     assert result.tolerances["armature"] == DECLARED.by_effect()["armature"]
     for joint in (j for j in JOINTS if j.endswith("calf")):
         assert result.box["coulomb"]["bound"][joint] == pytest.approx(0.3, abs=0.05)
+
+
+def test_a_tolerance_is_searched_as_far_as_it_reaches_or_refused() -> None:
+    wide = {"kp_scale": {"scale": 1.5}, "kd_scale": {"scale": 1.5}, "armature": {"added": 0.01}}
+    assert problems(wide, "tolerances") == []
+    for (effect, name), tolerance in Tolerances.from_effects(wide).replaced.items():
+        assert declared((effect, name)).high >= declared((effect, name)).null + tolerance
+    (line,) = problems({"armature": {"added": 0.2}}, "tolerances")
+    assert line == "tolerances.armature.added = 0.2: is wider than what is searched, -0.01 to 0.05 kg m2; at most 0.05"

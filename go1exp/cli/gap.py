@@ -18,7 +18,7 @@ from go1exp.cli.places import long_enough, read_all, writable
 from go1exp.cli.play_web import Port, address, gap
 from go1exp.cli.verbs import SUBVERBS, command
 from go1exp.config.choices import choice_files, config_folder, load
-from go1exp.config.hydra_adapter import read_yaml
+from go1exp.config.hydra_adapter import read_yaml, stored_choices
 from go1exp.config.schema import settings as schema
 from go1exp.config.schema.registry import ConfigError, FolderName, members, nearest, unknown_name
 from go1exp.config.schema.settings import MISSING
@@ -129,12 +129,23 @@ def _task(container: dict[str, Any]) -> int:
     from go1exp.gap.stages.explain import explain
 
     result = explain(recordings, robot, settings.search, _progress())
+    result = replace(result, provenance={**result.provenance, "next": _next(settings)})
     if older := files.remove_older(out):
         print(f"\nremoved, of the earlier answer in {out}: {', '.join(older)}")
     print(f"\n{result.sentence}\n\nwritten to {files.save(result, out)}")
     if settings.stage == "all" and result.verdict != "bad log":
         _apply(result, recordings, robot, settings)
     return _report(result, out) if settings.stage == "all" else result.exit_code
+
+
+def _next(settings: GapVerb) -> str:
+    """Return the call of ``gap next`` on the answer, with the names that were given."""
+    from go1exp.cli.hydra_main import job
+
+    chosen = next((o.partition("=")[2] for o in job().overrides if o.startswith("model=")), "go1")
+    logs = settings.logs if isinstance(settings.logs, str) else f"[{','.join(settings.logs)}]"
+    given = {"logs": logs, "model": stored_choices("model").get(chosen.strip("'\""), chosen), "out": settings.out}
+    return command("gap", "next", settings=given)
 
 
 def refuse_unknown(effects: Sequence[str]) -> None:

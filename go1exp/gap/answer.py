@@ -18,7 +18,7 @@ from go1exp.gap.score import angle_errors
 from go1exp.gap.score.likelihood import excess, removed
 from go1exp.gap.search import reduction, thresholds, tolerances
 from go1exp.gap.search.candidates import beyond, bounded, deviation, unexcited_rows
-from go1exp.gap.search.certainty import beside_a_gap, doubt, resampled_values, widened
+from go1exp.gap.search.certainty import beside_a_gap, doubt, exact_aliases, resampled_values, widened
 from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.state import LastCheck, Search
 from go1exp.sim.effects.base import Param
@@ -149,7 +149,11 @@ def name_terms(
                 interval[key[1]] = _intervals(known.param(key), theta[key], drawn[key], joints, at, unsure)
         status: Literal["certified", "compensating"] = "compensating" if reason else "certified"
         share = search.share_of(effect)
-        named.append(NamedEffect(effect, at, params, interval, search.aliases[effect], status, reason, share))
+        alike = exact_aliases(search, effect, at)
+        if alike and not reason:
+            reason = f"on these data it acts just as {' and '.join(alike)}"
+        aliases = tuple(dict.fromkeys([*search.aliases[effect], *alike]))
+        named.append(NamedEffect(effect, at, params, interval, aliases, status, reason, share))
     return tuple(named)
 
 

@@ -234,7 +234,8 @@ def motions(result: GapResult, names: Sequence[str], *settings: str, out: str) -
     """Return the command that records excitations; for a robot other than the Go1, the one that designs excitations."""
     if result.provenance.get("robot", GO1) == GO1:
         return shlex.join(["go1exp", "record", f"excitation=[{','.join(names)}]", *settings, f"out={out}"])
-    return f"go1exp gap next logs=RECORDINGS model=MODEL out=GAP  # for your robot; like {', '.join(names)}"
+    call = result.provenance.get("next", "go1exp gap next logs=RECORDINGS model=MODEL out=GAP")
+    return f"{call}  # for your robot; like {', '.join(names)}"
 
 
 def next_recordings(result: GapResult) -> list[Next]:
@@ -299,6 +300,10 @@ def sentence(answer: Answer, search: Search, unexcited: Mapping[str, str], sugge
         _opening(answer.verdict, first, search),
         *(_effect_sentence(effect, everyone, search.state.tolerances) for effect in answer.named),
     ]
+    if ends := at_range_ends(answer, search):
+        parts.append(
+            f"{'; '.join(ends)}: a value at the end of its range stands for more of it, or for something else."
+        )
     if answer.named:
         parts.append(
             f"With that the held-out error falls from {first:.3g} to {final:.3g} times the noise floor (floor 1)."
@@ -324,6 +329,19 @@ def sentence(answer: Answer, search: Search, unexcited: Mapping[str, str], sugge
     if quiet:
         parts.append(f"These logs cannot show {', '.join(quiet)}.")
     return " ".join([*filter(None, parts), *suggestions])
+
+
+def at_range_ends(answer: Answer, search: Search) -> list[str]:
+    """Return which fitted parameters lie at the end of the range that is searched, with joints and value."""
+    everyone, known, lines = search.state.scorer.windows.joints, search.state.tolerances, []
+    for key in sorted(key for key in answer.theta if math.isfinite(known.param(key).tolerance)):
+        p, values = known.param(key), np.ravel(answer.theta[key])
+        for bound in {p.low, p.high} - {p.null}:
+            near = np.flatnonzero(np.abs(values - bound) <= thresholds.AT_BOUND * p.tolerance)
+            if len(near):
+                at = f" at {where([everyone[k] for k in near], everyone)}" if len(values) == len(everyone) else ""
+                lines.append(f"{key[0]} ({p.name}){at} lies on its bound, {bound:g} {p.unit.strip('-')}".rstrip())
+    return lines
 
 
 def _opening(verdict: Verdict, first: float, search: Search) -> str:

@@ -141,6 +141,11 @@ class FixedBase:
         )
         return backend, setup
 
+    @property
+    def guessed_gains(self) -> bool:
+        """Whether the model has gains, for recordings that say none."""
+        return self.config.kp is not None or self.config.firmware is not None
+
     def drive(self) -> Term:
         """Return what turns commands into torques."""
         if self.config.drive == "torque":

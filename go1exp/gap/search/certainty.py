@@ -133,6 +133,50 @@ def on_bound(search: Search, effect: str, theta: Theta, joints: Sequence[str]) -
     return ""
 
 
+GAINS = ("kd_scale", "kp_scale", "strength")
+"""Effects of one law: the actuator's strength multiplies both gains."""
+
+
+def exact_aliases(search: Search, effect: str, joints: Sequence[str]) -> tuple[str, ...]:
+    """Return effects whose influence on these data is that of a term, up to a factor, at all joints where it is.
+
+    By the Jacobian of what may move: columns that are parallel. Strength acts as both gains together, so each of the
+    three is one with the two others where a model guesses its gains.
+    """
+    state, linear = search.state, search.state.table
+    layout = Layout.from_probes(state.machine, linear.probes)
+    chi2 = state.scorer.chi2(linear.residual, linear.windows)
+    matrix, _ = layout.total(linear.grams(state.scorer) / np.maximum(chi2, 1.0)[..., None, None])
+    everyone = state.scorer.windows.joints
+    of = np.array([linear.probes[k].key[0] for k in layout.probe])
+    at = np.isin(layout.joint, [-1, *(everyone.index(j) for j in joints)])
+    guessed = (
+        set(GAINS) - {effect} if effect in GAINS and getattr(state.machine, "guessed_gains", False) else set[str]()
+    )
+    rivals = [{name} for name in dict.fromkeys(of) if name != effect] + ([guessed] if guessed else [])
+    own = np.flatnonzero((of == effect) & at)
+
+    def acts_alike(names: set[str]) -> bool:
+        return all(
+            spanned(matrix, i, np.flatnonzero(np.isin(of, list(names)) & (layout.joint == layout.joint[i])))
+            for i in own
+        )
+
+    return tuple(sorted(set().union(*filter(acts_alike, rivals)))) if len(own) else ()
+
+
+def spanned(matrix: np.ndarray, column: int, others: np.ndarray) -> bool:
+    """Return whether columns (K,) span another one, by the normal equations (size, size) of all."""
+    power = matrix[column, column]
+    if not len(others) or not power > 0.0:
+        return False
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix)[others], 1e-300))
+    part = matrix[np.ix_(others, others)] * scale[:, None] * scale
+    right = matrix[others, column] * scale
+    left = power - right @ np.linalg.lstsq(part, right, rcond=1e-9)[0]
+    return bool(left < thresholds.PARALLEL * power)
+
+
 def doubt(search: Search, effect: str, theta: Theta, joints: Sequence[str], adequate: bool, check: LastCheck) -> str:
     """Return why a term is not certified; empty if it is."""
     stable, alone = search.shares.get(effect, 0.0), search.removes(effect)

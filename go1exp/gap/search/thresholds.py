@@ -45,6 +45,7 @@ MOST_OF_SMALL = 0.7  # share that a term must remove where the model is adequate
 # Fall of chi2 behind a bound from which an effect is listed although the tolerances explain the data.
 LISTED_RELIEF = 4.0
 ROUNDING = 1e-9  # share of a tolerance by which rounding may carry a clipped value beyond it
+PARALLEL = 1e-3  # share of a column's square that others leave, below which they act alike
 AT_BOUND = 0.02  # distance from a bound, in tolerances, that counts as at the bound
 
 # ---------------------------------------------------------------------- held-out tests

@@ -84,7 +84,7 @@ class FixedPoint(Effect):
     title = "fixed-point numbers in commands and reported torques"
     params = (Param("steps", "-", 0.0, 8.0, 0.0, 1.0, "robot", "steps over those of a Go1's packets; 0: none"),)
     identification = Identification(
-        levels=({"steps": 4.0},), excitation="torque_off", confounded=("viscous",), separated_by=TWO_KD
+        levels=({"steps": 2.0}, {"steps": 4.0}), excitation="torque_off", confounded=("viscous",), separated_by=TWO_KD
     )
     order = -10
 
@@ -116,7 +116,7 @@ class KdScale(Effect):
     """
 
     title = "a change of the velocity gain"
-    params = (Param("scale", "-", 0.0, 3.0, 1.0, 0.15, "joint", "real gain over configured gain"),)
+    params = (Param("scale", "-", 0.0, 5.0, 1.0, 0.15, "joint", "real gain over configured gain"),)
     identification = Identification(
         nominal=True, rank=1, excitation="torque_off", confounded=("viscous",), separated_by=TWO_KD
     )
@@ -135,7 +135,7 @@ class KpScale(Effect):
     """
 
     title = "a change of the position gain"
-    params = (Param("scale", "-", 0.2, 2.0, 1.0, 0.1, "joint", "real gain over configured gain"),)
+    params = (Param("scale", "-", 0.2, 5.0, 1.0, 0.1, "joint", "real gain over configured gain"),)
     identification = Identification(
         nominal=True,
         rank=0,

@@ -26,7 +26,7 @@ class Strength(Effect):
     """
 
     title = "a change of actuator strength"
-    params = (Param("scale", "-", 0.3, 1.5, 1.0, 0.05, "joint", "torque made over torque asked for"),)
+    params = (Param("scale", "-", 0.3, 3.0, 1.0, 0.05, "joint", "torque made over torque asked for"),)
     identification = Identification(
         nominal=True,
         rank=2,

@@ -81,16 +81,23 @@ DECLARED = Tolerances()
 
 
 def problems(by_effect: Mapping[str, Mapping[str, float]], path: str) -> list[str]:
-    """Return what is wrong with the names in a configuration of tolerances, one line each with its key path."""
+    """Return what is wrong with a configuration of tolerances, one line each with its key path.
+
+    Names must be known, and no tolerance may be wider than the range in which a parameter is searched.
+    """
     lines = []
     for effect, params in by_effect.items():
         if effect not in members("effect"):
             lines.append(unknown_name(f"{path}.{effect}", effect, members("effect"), "effect"))
             continue
         known = {p.name: p for p in effect_class(effect).params}
-        for name in params:
+        for name, tolerance in params.items():
             if name not in known:
                 lines.append(unknown_name(f"{path}.{effect}.{name}", name, known, "parameter"))
             elif not math.isfinite(known[name].tolerance):
                 lines.append(f"{path}.{effect}.{name}: is a shape, which has no tolerance")
+            elif tolerance > (most := max(known[name].high - known[name].null, known[name].null - known[name].low)):
+                p = known[name]
+                what = f"is wider than what is searched, {p.low:g} to {p.high:g} {p.unit.strip('-')}".rstrip()
+                lines.append(f"{path}.{effect}.{name} = {tolerance:g}: {what}; at most {most:g}")
     return lines

@@ -60,6 +60,8 @@ def build_fixed_base(
             spec.delete(joint)
     for part in (*spec.actuators, *spec.sensors, *spec.keys):
         spec.delete(part)
+    for body in spec.bodies:
+        body.simple = False  # a link whose mass an effect moves is not what MuJoCo calls simple
     trunk = spec.body(base)
     trunk.quat, trunk.name = list(base_quat), BASE
     if mounted:
