@@ -877,6 +877,11 @@ def test_rows_that_their_neighbours_rule_out_are_named_and_left_out() -> None:
     lost[[300, 900, 901, 1700]] = True
     zeros = with_(r, **{c: np.where(lost, 0.0, r.channels[c]) for c in joint_channels("q", JOINTS)})
     assert impossible(r).findings == ()
+    single = lost & (r.t < 1.0) | lost & (r.t > 3.0)
+    near = r.channels["q_FR_hip"] - r.channels["q_FR_hip"][single].mean() + 0.02  # rad, nearly zero there
+    alone = replace(r.meta, joints=JOINTS[:1], kp=(20.0,), kd=(0.5,), tau_limit=None)
+    one = Recording(alone, {"t": r.t, "q_FR_hip": np.where(single, 0.0, near)})
+    np.testing.assert_array_equal(impossible(one).rows, single)
     np.testing.assert_array_equal(impossible(zeros).rows, lost)
     spiked = r.channels["q_FR_hip"] + 0.3 * lost
     found = impossible(with_(r, q_FR_hip=spiked))

@@ -158,7 +158,7 @@ def exact_aliases(search: Search, effect: str, joints: Sequence[str]) -> tuple[s
 
     def acts_alike(names: set[str]) -> bool:
         return all(
-            spanned(matrix, i, np.flatnonzero(np.isin(of, list(names)) & (layout.joint == layout.joint[i])))
+            spanned(matrix, int(i), np.flatnonzero(np.isin(of, list(names)) & (layout.joint == layout.joint[i])))
             for i in own
         )
 

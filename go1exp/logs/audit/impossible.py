@@ -109,9 +109,14 @@ def _returned(x: np.ndarray) -> np.ndarray:
 def _spikes(x: np.ndarray, least: float) -> np.ndarray:
     """Return samples (T,) bool that go out and back by more than ``least`` and the usual, as no smooth motion does."""
     out = _returned(x)
-    residual = np.zeros(len(x))
-    residual[2:-2] = np.abs(x[2:-2] - (4.0 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) / 6.0)
-    return (out > max(least, limits.UNUSUAL * float(np.quantile(out, 0.9)))) & (residual > 0.5 * out)
+    return (out > max(least, limits.UNUSUAL * float(np.quantile(out, 0.9)))) & (_off(x) > 0.5 * out)
+
+
+def _off(x: np.ndarray) -> np.ndarray:
+    """Return how far each sample (T,) lies from the cubic through its four neighbours; 0 at the ends."""
+    off = np.zeros(len(x))
+    off[2:-2] = np.abs(x[2:-2] - (4.0 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) / 6.0)
+    return off
 
 
 def _zeros(values: np.ndarray, at_ends: bool) -> np.ndarray:
@@ -128,10 +133,14 @@ def _zeros(values: np.ndarray, at_ends: bool) -> np.ndarray:
     if not inner.any():
         return rows
     usual = limits.ZERO_JUMP * np.quantile(moved[inner], 0.95, axis=0) + 1e-6
+    if at_ends:  # a single row is known by less: what lies between its neighbours is not zero
+        off = np.stack([_off(x) for x in values.T], axis=1)
+        noise = np.array([np.quantile(x[x > 0.0], 0.9) if x.any() else 0.0 for x in off.T])
+        rows |= zero & np.any(off > limits.UNUSUAL * noise + 1e-6, axis=1)
     runs = signals.stretches(zero)
     for a, b in runs:
         ends = [moved[i] for i in (a - 1, b - 1) if 0 <= i < len(moved)]
-        rows[a:b] = len(ends) > (not at_ends) and all(np.any(end > usual) for end in ends)
+        rows[a:b] |= len(ends) > (not at_ends) and all(np.any(end > usual) for end in ends)
     return rows
 
 
