@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +101,7 @@ def test_the_loop_ends_for_a_reason(
         assert (rows[-1].names, rows[-1].power) == ((("viscous",),), 1.0)
     if isinstance(verdicts[0], DesignError):  # nobody knows the chance; the search's equals are left
         assert (rows[0].names, rows[0].power) == ((("viscous", "kd_scale"),), None)
-        assert json.loads(json.dumps(rows[0].as_dict()))["power"] is None
+        assert json.loads(json.dumps(asdict(rows[0])))["power"] is None
         assert stage_loop.table(rows).splitlines()[1].split()[:3] == ["0", f"{rows[0].robot_seconds:.1f}", "–"]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -214,7 +215,7 @@ def _loop(container: dict[str, Any]) -> int:
         lambda turn: _keep(turn, out),
         _progress(),
     )
-    write_json(out / TABLE, [row.as_dict() for row in rows], indent=1)
+    write_json(out / TABLE, [asdict(row) for row in rows], indent=1)
     print(f"\n{table(rows)}\n\nwritten to {out / TABLE}")
     return 0 if rows[-1].ended == "one name is left" else FAILED
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import get_args
 
 import numpy as np
 
 from go1exp.base.errors import Expected
-from go1exp.gap.data.cutting import Place
 from go1exp.gap.data.prepare import Ready, too_coarse
 from go1exp.gap.data.windows import Splits, Windows, splits, stretches
 from go1exp.gap.replay.replayer import LEVEL
@@ -113,7 +113,7 @@ def prepare(recordings: Sequence[Recording], robot: Robot, settings: GapSettings
         NotComparable: if too many of them cannot.
     """
     robot = robot.suited(recordings, settings.phase)
-    recordings, removed = _possible(recordings)
+    recordings, removed = _without_impossible_rows(recordings)
     reports = [audit(r) for r in recordings]
     clocks = clock_flaws(reports)
     flaws = [
@@ -135,8 +135,8 @@ def prepare(recordings: Sequence[Recording], robot: Robot, settings: GapSettings
     return robot, Ready(ready.recordings, ready.settings, ready.ignored, (*omitted, *ready.warnings))
 
 
-def _possible(recordings: Sequence[Recording]) -> tuple[list[Recording], list[str]]:
-    """Return recordings without rows that their neighbours rule out, and a line for each; with too many, as it is."""
+def _without_impossible_rows(recordings: Sequence[Recording]) -> tuple[list[Recording], list[str]]:
+    """Return recordings without such rows, and a line for each kind; one with many stays as it is, for the audit."""
     kept, lines = [], []
     for r in recordings:
         marked = impossible(r)
@@ -245,11 +245,9 @@ def _compared_clocks(
     if without:
         reason = f"{len(without)} of {len(written)} recordings have no speeds, so there is one clock only"
         return replace(default, reason=reason)
-    spared = [np.zeros(len(r.t), dtype=bool) for r in written]
-    for name in names:
-        for mask, kept in zip(spared, _last_check(recordings, robot.by_clock(name), settings), strict=True):
-            mask |= kept
-    cuts = {name: _cut(robot.by_clock(name, "ignored"), ready[name]) for name in names}
+    kept = [_last_check(recordings, robot.by_clock(name), settings) for name in names]
+    spared = [np.logical_or(*masks) for masks in zip(*kept, strict=True)]
+    cuts = {name: partial(robot.by_clock(name, "ignored").windows, ready[name]) for name in names}
     plan = ready["recorded"].settings
     try:
         windows, left = same_rows({name: r.recordings for name, r in ready.items()}, cuts, plan, spared)
@@ -272,10 +270,6 @@ def _compared_clocks(
         sides[name] = Contestant(scorer, dt)
     choice = contest(sides, parts, plan, lambda what, share: on_progress(what, 0.0))
     return replace(choice, rate_hz=default.rate_hz, steps=default.steps)
-
-
-def _cut(robot: FixedBase, ready: Ready) -> Callable[[Sequence[Sequence[Place]]], Windows]:
-    return lambda places: robot.windows(ready, places)
 
 
 def _last_check(recordings: Sequence[Recording], robot: FixedBase, settings: GapSettings) -> list[np.ndarray]:

@@ -254,12 +254,8 @@ def _order(worth: Worth) -> tuple[float, float]:
 
 def _value(worths: Sequence[Worth], goals: Sequence[int]) -> tuple[float, float, float]:
     """Return by what designs are ranked: the least power over the goals, the mean, the least difference."""
-    wanted = [worths[k] for k in goals]
-    return (
-        min(w.power for w in wanted),
-        float(np.mean([w.power for w in wanted])),
-        min(w.gain for w in wanted),
-    )
+    powers, gains = zip(*((worths[k].power, worths[k].gain) for k in goals), strict=True)
+    return min(powers), float(np.mean(powers)), min(gains)
 
 
 def attainable(worths: Sequence[tuple[Worth, ...]], fallback: bool) -> list[int]:

@@ -101,19 +101,19 @@ def fitted_alike(
         between = rungs[max(k - 1, 0)], rungs[min(k + 1, len(rungs) - 1)]
         nearest = minimize_scalar(at, bounds=between, options={"maxiter": thresholds.RUNG_TRIES})
         value, least = (nearest.x, float(nearest.fun)) if nearest.fun < costs[k] else (rungs[k], costs[k])
-        theta = {**theta, key: _everywhere(score, key, value)}
+        theta = _with(score, theta, key, value)
     return theta, least
 
 
-def _everywhere(score: Scorer, key: Key, value: float) -> np.ndarray:
-    """Return one value of a parameter for all joints (J,), or for the robot (1,)."""
+def _with(score: Scorer, theta: Theta, key: Key, value: float) -> Theta:
+    """Return the values with one of a parameter alike at all joints (J,), or for the robot (1,)."""
     wide = len(score.windows.joints) if declared(key).per == "joint" else 1
-    return np.full(wide, value)
+    return {**theta, key: np.full(wide, value)}
 
 
 def _along(score: Scorer, key: Key, others: Theta, windows: np.ndarray, dt: float) -> Callable[[float], float]:
     """Return the cost as a function of one parameter, the others held."""
-    return lambda value: profile_cost(score, {**others, key: _everywhere(score, key, value)}, windows, dt)
+    return lambda value: profile_cost(score, _with(score, others, key, value), windows, dt)
 
 
 def within_tolerances(score: Scorer, begin: Theta, keys: Sequence[Key], windows: np.ndarray, dt: float) -> Theta:
@@ -126,7 +126,7 @@ def within_tolerances(score: Scorer, begin: Theta, keys: Sequence[Key], windows:
             _along(score, key, theta, windows, dt), bounds=limits[key], options={"maxiter": thresholds.RUNG_TRIES}
         )
         if nearest.fun < least:
-            theta, least = {**theta, key: _everywhere(score, key, nearest.x)}, float(nearest.fun)
+            theta, least = _with(score, theta, key, nearest.x), float(nearest.fun)
     return theta
 
 

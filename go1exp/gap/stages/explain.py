@@ -16,7 +16,7 @@ from go1exp.gap.answer import Answer, can_stand, concluded, evidence, not_excite
 from go1exp.gap.comparison import FEWEST_WINDOWS, Comparison, NotComparable, Progress, compare, robot_from
 from go1exp.gap.data.prepare import fingerprint
 from go1exp.gap.replay.rows import Theta, variants
-from go1exp.gap.report.words import advice, sentence
+from go1exp.gap.report.words import ALL_UNITS, advice, sentence
 from go1exp.gap.result import (
     EXIT_CODES,
     AngleErrors,
@@ -280,8 +280,6 @@ def _nested(
 
 # ---------------------------------------------------------------------- a first look
 
-UNITS = {"q": "rad", "qd": "rad/s", "tau_est": "N m", "imu_gyro": "rad/s", "imu_acc": "m/s2"}
-
 
 @dataclass(frozen=True)
 class CheckResult:
@@ -317,7 +315,7 @@ class CheckResult:
         lines = [f"{self.windows} windows; the plain model's error is {1 + self.excess:.3g} times the floor"]
         lines = [*self.warnings, *lines]
         for name, value in self.floors.noise.items():
-            line = f"  {name}: noise {value:.2g} {UNITS[name]}, error of the step {self.floors.numerical[name]:.2g}"
+            line = f"  {name}: noise {value:.2g} {ALL_UNITS[name]}, error of the step {self.floors.numerical[name]:.2g}"
             if self.floors.repeatability and name in self.floors.repeatability:
                 line += f", repetitions differ by {self.floors.repeatability[name]:.2g}"
             lines.append(line)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 from go1exp.gap.comparison import Progress
 from go1exp.gap.design.plan import DesignError, DesignSettings
@@ -43,10 +42,6 @@ class Round:
     power: float | None
     next: str
     ended: str
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return it as plain values."""
-        return asdict(self)
 
 
 @dataclass(frozen=True)

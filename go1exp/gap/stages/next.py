@@ -94,13 +94,7 @@ class NextResult:
             design["seconds"] = self.seconds
         pairs = [{**asdict(p), "separable": not p.reason} for p in self.pairs]
         about = {"rate_hz": self.rate_hz, "joints": list(self.joints), "tried": self.tried, "beyond": self.beyond}
-        return {
-            "verdict": self.verdict,
-            "design": design,
-            "pairs": pairs,
-            "settled": list(self.distinguishable),
-            **about,
-        }
+        return {"verdict": self.verdict, "design": design, "pairs": pairs, "settled": [*self.distinguishable], **about}
 
 
 def model_of(result: GapResult, robot: Robot) -> Theta:

@@ -20,6 +20,8 @@ from go1exp.gap.comparison import Comparison, NotComparable, Progress, compare, 
 from go1exp.gap.data.cutting import even_clock, noise_of
 from go1exp.gap.data.standing import AXES, rows_at
 from go1exp.gap.replay.rows import Rows, variants
+from go1exp.gap.report import words
+from go1exp.gap.report.words import UNITS
 from go1exp.gap.result import GapSettings
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score.initial_state import solved
@@ -28,10 +30,9 @@ from go1exp.gap.search.fit import residuals
 from go1exp.logs.recording import VECTORS, Recording, joint_channels
 from go1exp.robot.config import RobotConfig
 
-UNITS = {"q": "rad", "qd": "rad/s", "tau_est": "N m"}
 TURN, SPEED = ("roll", "pitch", "yaw"), ("base_lin_vel_x_b", "base_lin_vel_y_b", "base_lin_vel_z_b")
 TRUNK_CHANNELS = {"imu_gyro": AXES[:3], "imu_acc": AXES[3:], "attitude": TURN, "base_lin_vel": SPEED}
-TRUNK_UNITS = {"imu_gyro": "rad/s", "imu_acc": "m/s2", "attitude": "rad", "base_lin_vel": "m/s"}
+TRUNK_UNITS = words.TRUNK_UNITS | {"attitude": "rad", "base_lin_vel": "m/s"}
 WORST = 3  # windows that are named as the worst
 
 
@@ -74,15 +75,12 @@ class Part:
         """Return it as lines for people."""
         total, noise = self.total, dict(zip(self.channels, self.noise, strict=True))
         kinds = [name for name in UNITS if joint_channels(name, self.joints)[0] in total]
+        rows = {joint: [total[joint_channels(name, [joint])[0]] for name in kinds] for joint in self.joints}
+        rows["all"] = [self.quantity(name) for name in kinds]
+        rows["noise"] = [np.median([noise[c] for c in joint_channels(name, self.joints)]) for name in kinds]
         lines = [f"{len(self.begin)} windows; error {self.times_floor:.3g} times the floor (1 is right)"]
         lines.append(f"  {'RMSE':10}" + "".join(f"{f'{name}, {UNITS[name]}':>16}" for name in kinds))
-        for joint in self.joints:
-            lines.append(
-                f"  {joint:10}" + "".join(f"{total[joint_channels(name, [joint])[0]]:16.4g}" for name in kinds)
-            )
-        lines.append(f"  {'all':10}" + "".join(f"{self.quantity(name):16.4g}" for name in kinds))
-        typical = [np.median([noise[c] for c in joint_channels(name, self.joints)]) for name in kinds]
-        lines.append(f"  {'noise':10}" + "".join(f"{value:16.4g}" for value in typical))
+        lines += [f"  {label:10}" + "".join(f"{value:16.4g}" for value in values) for label, values in rows.items()]
         for name, columns in TRUNK_CHANNELS.items():
             if columns[0] in total:
                 known = np.array([noise[c] for c in columns])
@@ -132,14 +130,9 @@ class ReplayResult:
                 {"episode": e, "begin": float(b), "rmse": dict(zip(part.channels, map(float, row), strict=True))}
                 for e, b, row in zip(part.episodes, part.begin, part.rmse, strict=True)
             ]
-            about = {"rmse": part.total, "noise": known, "times_floor": part.times_floor, "windows": each}
-            parts.append(about)
-        return {
-            "physics_dt": self.physics_dt,
-            "warnings": list(self.warnings),
-            "flaws": list(self.flaws),
-            "parts": parts,
-        }
+            parts.append({"rmse": part.total, "noise": known, "times_floor": part.times_floor, "windows": each})
+        about = {"warnings": list(self.warnings), "flaws": list(self.flaws)}
+        return {"physics_dt": self.physics_dt, **about, "parts": parts}
 
 
 def replay(
@@ -161,20 +154,18 @@ def replay(
     robot = robot_from(robot)
     settings = dataclasses.replace(settings, torque=False, physics_dt=physics_dt, phase="whole")
     kinds = [[r for r in recordings if (r.meta.base == "floating") == free] for free in (False, True)]
-    comparisons = []
-    parts: list[Part] = []
+    replayed = ReplayResult(physics_dt=physics_dt)
     with one_thread():
         for same_base in filter(None, kinds):
-            on_progress("replaying the logs", len(parts) / 2)
+            on_progress("replaying the logs", len(replayed.parts) / 2)
             try:
                 comparison = compare(same_base, robot, settings, physics_dt=physics_dt, fewest=1)
             except NotComparable as error:
                 return ReplayResult(error.flaws)
-            comparisons.append(comparison)
-            parts.append(_part(comparison))
+            warnings = (*replayed.warnings, *comparison.ready.warnings)
+            replayed = ReplayResult((), (*replayed.parts, _part(comparison)), warnings, comparison.dt)
     on_progress("done", 1.0)
-    warnings = tuple(warning for comparison in comparisons for warning in comparison.ready.warnings)
-    return ReplayResult((), tuple(parts), warnings, comparisons[-1].dt if comparisons else physics_dt)
+    return replayed
 
 
 def _part(comparison: Comparison) -> Part:
@@ -278,17 +269,18 @@ def _measured_trunk(recordings: Sequence[Recording], taken: Callable[[Sequence[n
     return readings, reference, noise
 
 
+def _turns(quat: np.ndarray) -> Rotation:
+    return Rotation.from_quat(quat.reshape(-1, 4), scalar_first=True)
+
+
 def _turned_back(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """Return vectors (..., 3) of the world in the axes of bodies with attitudes (..., 4)."""
-    turn = Rotation.from_quat(quat.reshape(-1, 4), scalar_first=True)
-    return np.asarray(turn.inv().apply(vector.reshape(-1, 3))).reshape(vector.shape)
+    return np.asarray(_turns(quat).inv().apply(vector.reshape(-1, 3))).reshape(vector.shape)
 
 
 def _trunk(simulated: np.ndarray, reference: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the turn (W, n) from measured to simulated attitude, and the velocity in the simulated trunk's axes."""
     quat, speed = simulated[..., :4], simulated[..., 4:]
-    shape = (*quat.shape[:2], 3)
-    measured, model = (Rotation.from_quat(v.reshape(-1, 4), scalar_first=True) for v in (reference["attitude"], quat))
-    turn = (measured.inv() * model).as_rotvec().reshape(shape)
+    turn = (_turns(reference["attitude"]).inv() * _turns(quat)).as_rotvec().reshape(speed.shape)
     channels = dict(zip(TURN, np.moveaxis(turn, 2, 0), strict=True))
     return channels | dict(zip(SPEED, np.moveaxis(_turned_back(quat, speed), 2, 0), strict=True))
