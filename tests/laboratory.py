@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+import torch
 
 import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
 from go1exp.cli.app import parse
@@ -12,6 +14,7 @@ from go1exp.config.compose import compose
 from go1exp.config.schema.registry import bind
 from go1exp.logs.record import plan, simulate
 from go1exp.logs.recording import Recording
+from go1exp.sim.env.plant import Plant
 from go1exp.sim.task import parse_parts
 
 
@@ -30,3 +33,25 @@ def recorded(
     rig = simulate.Rig(**parts, physics_dt=settings.physics_dt)
     episodes = plan.episodes([t for t in terms if t], settings)
     return rig, tuple(simulate.play(rig, episodes, settings.sensors, settings.seed, lambda done, total: None))
+
+
+def at_rest(
+    robot: Any,
+    effects: Mapping[str, Any],
+    start: Any,
+    kp: float,
+    kd: float,
+    dt: float,
+    quat: Any = (1.0, 0.0, 0.0, 0.0),
+) -> Plant:
+    """Return the plant of one robot with effects, held at an attitude; its joints rest at ``start`` (1, J)."""
+    backend, setup = robot.build(1, dt, quat, 1)
+    terms = [bind("effect", name, dict(values), name)[0] for name, values in effects.items()]
+    plant = Plant(backend, setup, robot.drive(), [term for term in terms if term])
+    if kp or kd:
+        plant.set_gains(torch.full_like(plant.q, kp), torch.full_like(plant.q, kd))
+    plant.startup()
+    everyone, begin = torch.ones(1, dtype=torch.bool), torch.as_tensor(start, dtype=plant.q.dtype)
+    backend.reset(everyone, begin.clone(), torch.zeros_like(begin))
+    plant.reset(everyone, begin)
+    return plant

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from go1exp.config.compose import compose
 from go1exp.gap.comparison import compare, robot_from
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import GapSettings
@@ -17,7 +16,6 @@ from go1exp.gap.search import state as search_state
 from go1exp.gap.search import tolerances
 from go1exp.gap.search.fit import descend, fit
 from go1exp.gap.search.state import State
-from go1exp.sim.task import parse_parts
 from tests.laboratory import recorded
 
 FRICTION = ("coulomb", "bound")
@@ -28,10 +26,9 @@ THETA: Theta = {FRICTION: np.full(12, 0.2)}
 def hung() -> State:
     """A robot with friction of 0.2 N m, and a model that may have it."""
     hidden = ["effect=coulomb", "effect.coulomb.bound=0.2"]
-    _, logs = recorded(["seconds=2", "excitation=[chirp,steps]", "gains=[[20,0.5],[35,0.6]]", *hidden])
-    config = parse_parts(compose("gap", ["logs=none"]), ("robot",))[0]["robot"]
+    rig, logs = recorded(["seconds=2", "excitation=[chirp,steps]", "gains=[[20,0.5],[35,0.6]]", *hidden])
     settings = GapSettings(stride_s=0.4, window_s=0.2)
-    comparison = compare(list(logs), robot_from(config), settings)
+    comparison = compare(list(logs), robot_from(rig.robot), settings)
     parts = comparison.split(np.random.default_rng(0))
     return State(comparison.scorer, parts, settings, comparison.dt, terms=("coulomb",))
 

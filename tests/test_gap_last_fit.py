@@ -9,7 +9,6 @@ from typing import cast
 import numpy as np
 import pytest
 
-from go1exp.config.compose import compose
 from go1exp.gap.comparison import compare, robot_from
 from go1exp.gap.replay.rows import Probe, Theta
 from go1exp.gap.result import GapSettings
@@ -19,7 +18,6 @@ from go1exp.gap.search import thresholds
 from go1exp.gap.search.certainty import opposite, resampled_values, semidefinite
 from go1exp.gap.search.state import State, begun
 from go1exp.sim.effects.tolerances import DECLARED
-from go1exp.sim.task import parse_parts
 from tests.laboratory import recorded
 
 HIDDEN_S = 0.005
@@ -31,10 +29,9 @@ def delays(monkeypatch: pytest.MonkeyPatch, finer: int) -> tuple[np.ndarray, np.
     """Return the delay (J,) and its resamples (B, J), s, of a robot whose drives obey late, stepped finely."""
     monkeypatch.setattr(thresholds, "FINER_STEPS", finer)
     hidden = ["effect=command_delay", f"effect.command_delay.delay={HIDDEN_S}", "physics_dt=0.000125"]
-    _, logs = recorded(["seconds=2", "excitation=[steps]", "gains=[[20,0.5],[35,0.6],[35,1.2]]", *hidden])
-    config = parse_parts(compose("gap", ["logs=none"]), ("robot",))[0]["robot"]
+    rig, logs = recorded(["seconds=2", "excitation=[steps]", "gains=[[20,0.5],[35,0.6],[35,1.2]]", *hidden])
     rng = np.random.default_rng(0)
-    comparison = compare(list(logs), robot_from(config), QUICK)
+    comparison = compare(list(logs), robot_from(rig.robot), QUICK)
     parts = comparison.split(rng)
     search = begun(comparison.scorer, parts, comparison.settings, comparison.dt, rng)
     key = ("command_delay", "delay")

@@ -11,7 +11,6 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from go1exp.config.schema.registry import bind
 from go1exp.gap.comparison import compare
 from go1exp.gap.result import GapResult, GapSettings
 from go1exp.gap.robots.description import ModelConfig, parse_model
@@ -20,8 +19,8 @@ from go1exp.gap.search.fit import scores
 from go1exp.gap.stages.explain import explain
 from go1exp.logs.recording import Recording, joint_channel
 from go1exp.sim.effects.base import Measured
-from go1exp.sim.env.plant import Plant
 from tests import made
+from tests.laboratory import at_rest
 
 LEG = """
 <mujoco>
@@ -64,19 +63,12 @@ def leg(folder: Path) -> FixedBase:
 def recorded(robot: FixedBase, effects: Mapping[str, Mapping[str, Any]], seconds: float = 2.5) -> list[Recording]:
     """Let it follow sums of sines in two attitudes of the stand, with 0.2 mrad and 0.02 rad/s of noise."""
     found, t = [], np.arange(round(seconds / STEP)) * STEP
-    terms = [bind("effect", name, dict(values), name)[0] for name, values in effects.items()]
     for n in range(4):
         rng, quat = np.random.default_rng(n), HANGS[n % 2]
-        backend, setup = robot.build(1, STEP, quat, 1)
-        plant = Plant(backend, setup, robot.drive(), [term for term in terms if term])
-        plant.set_gains(torch.full((1, 3), 25.0).double(), torch.full((1, 3), 0.6).double())
-        plant.startup()
         frequency, phase = rng.uniform(0.3, 3.0, (3, 4)), rng.uniform(0.0, 2 * np.pi, (3, 4))
         swing = 0.18 * np.sin(2 * np.pi * frequency[..., None] * t + phase[..., None]).sum(1).T
         target = REST + swing * np.minimum(t / 0.3, 1.0)[:, None]
-        everyone = torch.ones(1, dtype=torch.bool)
-        backend.reset(everyone, torch.as_tensor(target[:1]), torch.zeros(1, 3).double())
-        plant.reset(everyone, torch.as_tensor(target[:1]))
+        plant = at_rest(robot, effects, target[:1], 25.0, 0.6, STEP, quat)
         readings = []
         for k, row in enumerate(target):
             if k % EVERY == 0:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from go1exp.base.paths import data_root
 from go1exp.cli.hydra_main import choices_from_files
 from go1exp.config.compose import compose
-from go1exp.config.schema.registry import ConfigError, bind
+from go1exp.config.schema.registry import ConfigError
 from go1exp.gap.answer import name_terms
 from go1exp.gap.comparison import NotComparable, compare, prepare
 from go1exp.gap.data.prepare import MOST_WINDOWS, clock_of_speeds, noise_in_time, slope
@@ -35,8 +35,8 @@ from go1exp.gap.stages.explain import explain
 from go1exp.logs.importers import import_recordings
 from go1exp.logs.recording import Recording, joint_channel
 from go1exp.sim.effects.tolerances import declared
-from go1exp.sim.env.plant import Plant
 from tests import made
+from tests.laboratory import at_rest
 
 MODELS = sorted(f.stem for f in (data_root() / "conf/model").glob("*.yaml") if f.stem != "go1")
 DATA = Path(os.environ.get("GO1EXP_DATA", data_root().parent / "shared/data"))
@@ -325,21 +325,28 @@ def test_a_held_signal_is_averaged_over_steps() -> None:
 
 def played(robot: FixedBase, effects: Mapping[str, Mapping[str, Any]], target: np.ndarray, every: int) -> np.ndarray:
     """Play targets (K, J), one per 0.5 ms step, on the model with effects; return angles at every so many steps."""
-    backend, setup = robot.build(1, 0.0005, LEVEL, 1)
-    terms = [bind("effect", name, dict(values), name)[0] for name, values in effects.items()]
-    plant = Plant(backend, setup, robot.drive(), [term for term in terms if term])
-    if robot.config.drive != "torque":
-        plant.set_gains(torch.full((1, 1), 3.0).double(), torch.full((1, 1), 0.05).double())
-    plant.startup()
-    everyone = torch.ones(1, dtype=torch.bool)
-    backend.reset(everyone, torch.zeros_like(backend.qpos), torch.zeros_like(backend.qvel))
-    plant.reset(everyone, torch.as_tensor(target[:1]))
+    kp, kd = (0.0, 0.0) if robot.config.drive == "torque" else (3.0, 0.05)
+    plant = at_rest(robot, effects, target[:1], kp, kd, 0.0005)
     found = []
     for k, row in enumerate(target):
         if k % every == 0:
             found.append(plant.q[0].numpy().copy())
         plant.step(torch.as_tensor(row[None]))
     return np.array(found)
+
+
+def swung(
+    robot: FixedBase, effects: Mapping[str, Mapping[str, Any]], wide: float, speeds: Sequence[float], seconds: float
+) -> list[Recording]:
+    """Record the servo that swings its pendulum, ``wide`` rad, by two sines of each speed; noise of 0.2 mrad."""
+    steps, logs = np.arange(0.0, seconds, 0.0005), []
+    for n, speed in enumerate(speeds):
+        target = (wide * np.sin(speed * steps) + 0.4 * np.sin(2.3 * speed * steps))[:, None]
+        q = played(robot, effects, target, 10)
+        q += 2e-4 * np.random.default_rng(n).standard_normal(q.shape)
+        about: dict[str, Any] = {"kp": (3.0,), "kd": (0.05,), "episode": f"e{n}"}
+        logs.append(recording(("pendulum",), steps[::10], {"q": q, "q_target": target[::10]}, **about))
+    return logs
 
 
 QUICK = GapSettings(
@@ -366,13 +373,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/", "conf/model/")
 def test_friction_hidden_in_a_servo_is_named() -> None:
     robot = machine("xl330_pendulum", tolerances={})
-    steps, logs = np.arange(0.0, 6.0, 0.0005), []
-    for n, speed in enumerate((3.0, 5.0, 8.0)):
-        target = (0.8 * np.sin(speed * steps) + 0.4 * np.sin(2.3 * speed * steps))[:, None]
-        q = played(robot, {"coulomb": {"bound": 0.12}}, target, 10)
-        q += 2e-4 * np.random.default_rng(n).standard_normal(q.shape)
-        logs.append(recording(("pendulum",), steps[::10], {"q": q, "q_target": target[::10]}, kp=(3.0,), kd=(0.05,)))
-    logs = [dataclasses.replace(r, meta=dataclasses.replace(r.meta, episode=f"e{n}")) for n, r in enumerate(logs)]
+    logs = swung(robot, {"coulomb": {"bound": 0.12}}, 0.8, (3.0, 5.0, 8.0), 6.0)
     result = explain(logs, robot, QUICK)
     assert [n.effect for n in result.named] == ["coulomb"], result.sentence
     assert result.named[0].params["bound"]["pendulum"] == pytest.approx(0.12, abs=0.01)
@@ -386,13 +387,8 @@ def test_friction_hidden_in_a_servo_is_named() -> None:
 def test_friction_of_loaded_gears_is_told_from_dry_friction_and_by_its_law(external: float) -> None:
     """A weight that is swung up to the level loads the gears by up to 0.5 N m, hanging down by nothing."""
     robot = machine("xl330_pendulum", tolerances={"coulomb": {"bound": 0.01}})
-    steps, logs, hidden = np.arange(0.0, 6.0, 0.0005), [], {"coefficient": 0.2, "external": external}
-    for n, speed in enumerate((2.0, 3.0, 5.0, 8.0)):
-        target = (1.0 * np.sin(speed * steps) + 0.4 * np.sin(2.3 * speed * steps))[:, None]
-        q = played(robot, {"load_friction": hidden}, target, 10)
-        q += 2e-4 * np.random.default_rng(n).standard_normal(q.shape)
-        logs.append(recording(("pendulum",), steps[::10], {"q": q, "q_target": target[::10]}, kp=(3.0,), kd=(0.05,)))
-    logs = [dataclasses.replace(r, meta=dataclasses.replace(r.meta, episode=f"e{n}")) for n, r in enumerate(logs)]
+    hidden = {"load_friction": {"coefficient": 0.2, "external": external}}
+    logs = swung(robot, hidden, 1.0, (2.0, 3.0, 5.0, 8.0), 6.0)
     result = explain(logs, robot, dataclasses.replace(QUICK, effects=("coulomb", "load_friction")))
     assert [n.effect for n in result.named] == ["load_friction"], result.sentence
     assert result.named[0].params["external"]["pendulum"] == external
@@ -407,13 +403,8 @@ def test_friction_of_loaded_gears_is_told_from_dry_friction_and_by_its_law(exter
 def test_a_value_that_is_held_has_no_interval() -> None:
     """The law of a loaded gear's friction is chosen and held; only the coefficient is fitted, and uncertain."""
     robot = machine("xl330_pendulum", tolerances={})
-    steps, logs, hidden = np.arange(0.0, 3.0, 0.0005), [], {"coefficient": 0.2, "external": 1.0}
-    for n, speed in enumerate((2.0, 3.0, 5.0)):
-        target = (1.0 * np.sin(speed * steps) + 0.4 * np.sin(2.3 * speed * steps))[:, None]
-        q = played(robot, {"load_friction": hidden}, target, 10)
-        q += 2e-4 * np.random.default_rng(n).standard_normal(q.shape)
-        logs.append(recording(("pendulum",), steps[::10], {"q": q, "q_target": target[::10]}, kp=(3.0,), kd=(0.05,)))
-    logs = [dataclasses.replace(r, meta=dataclasses.replace(r.meta, episode=f"e{n}")) for n, r in enumerate(logs)]
+    hidden = {"coefficient": 0.2, "external": 1.0}
+    logs = swung(robot, {"load_friction": hidden}, 1.0, (2.0, 3.0, 5.0), 3.0)
     rng = np.random.default_rng(0)
     found = compare(logs, robot, QUICK)
     search = begun(found.scorer, found.split(rng), found.settings, found.dt, rng)

@@ -47,9 +47,8 @@ from go1exp.logs.record.motions import playback
 from go1exp.logs.record.simulate import held_quat
 from go1exp.logs.recording import Recording, joint_channels
 from go1exp.robot import JOINTS, NOMINAL_STANCE, soft_limits
-from go1exp.sim.env.plant import Plant
 from tests import made
-from tests.laboratory import recorded
+from tests.laboratory import at_rest, recorded
 
 ARM = """<mujoco><compiler angle="radian"/><worldbody><body name="stand" pos="0 0 1">
 <inertial mass="1" pos="0 0 0" diaginertia="1e-3 1e-3 1e-3"/>
@@ -89,13 +88,7 @@ def told(
         assert term
         t = np.arange(1500) * 0.002
         motion = term(t, np.array(centre), np.tile([-1.4, 1.4], (len(joints), 1)), np.random.default_rng(k))
-        backend, setup = machine.build(1, 0.0005, LEVEL, 1)
-        plant = Plant(backend, setup, machine.drive(), ())
-        plant.set_gains(torch.full_like(plant.q, 15.0), torch.full_like(plant.q, 0.3))
-        plant.startup()
-        everyone, start = torch.ones(1, dtype=torch.bool), torch.tensor(motion.target[:1], dtype=plant.q.dtype)
-        backend.reset(everyone, start.clone(), torch.zeros_like(start))
-        plant.reset(everyone, start)
+        plant = at_rest(machine, {}, motion.target[:1], 15.0, 0.3, 0.0005)
         rows = []
         for target in torch.tensor(motion.target[:, None], dtype=plant.q.dtype):
             rows.append(np.stack([plant.q[0].numpy(), plant.speed()[0].numpy(), target[0].numpy()]))

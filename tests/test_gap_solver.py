@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 
 import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
 from go1exp.cli.record import RIG
@@ -102,21 +103,44 @@ def simulate_config() -> Any:
     return parts["robot"]
 
 
-def test_a_bounded_fit_is_a_minimum_within_its_bounds() -> None:
-    rng = np.random.default_rng(3)
-    a = rng.standard_normal((30, 6))
-    matrix, right = a.T @ a, a.T @ rng.standard_normal(30)
-    limits = Bounds(-0.1 * np.ones(6), 0.1 * np.ones(6), rng.standard_normal(6), 0.5 * np.ones(6))
-    x = solve(matrix, right, limits)
-    slope = 2 * (matrix @ x - right + limits.weight * (x - limits.centre))
-    inside = np.abs(x) < 0.1 - 1e-9
-    np.testing.assert_allclose(slope[inside], 0.0, atol=1e-6)
-    assert np.all(slope[x > 0.1 - 1e-9] <= 1e-6)
-    assert np.all(slope[x < -0.1 + 1e-9] >= -1e-6)
-    assert (~inside).any()
-    free = Bounds(-np.full(6, np.inf), np.full(6, np.inf), limits.centre, limits.weight)
-    expected = np.linalg.solve(matrix + 0.5 * np.eye(6), right + 0.5 * limits.centre)
-    np.testing.assert_allclose(solve(matrix, right, free), expected, atol=1e-6)
+def limits(low: float, high: float, weight: float, size: int) -> Bounds:
+    ones = np.ones(size)
+    return Bounds(low * ones, high * ones, 0.0 * ones, weight * ones)
+
+
+@pytest.mark.parametrize("bound", [0.1, np.inf])
+def test_a_bounded_fit_is_bounded_least_squares(bound: float) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        columns, wanted, centre = (rng.standard_normal(shape) for shape in ((40, 8), 40, 8))
+        some = replace(limits(-bound, 1.5 * bound, 2.0, 8), centre=centre)
+        x = solve(columns.T @ columns, columns.T @ wanted, some)
+        rows = np.vstack([columns, np.sqrt(2.0) * np.eye(8)])
+        whole = np.concatenate([wanted, np.sqrt(2.0) * centre])
+        np.testing.assert_allclose(x, lsq_linear(rows, whole, (-bound, 1.5 * bound), tol=1e-12).x, atol=1e-6)
+
+
+def test_what_may_not_move_stays_and_the_rest_makes_up_for_it() -> None:
+    rng = np.random.default_rng(1)
+    columns, wanted, fixed = rng.standard_normal((40, 6)), rng.standard_normal(40), np.array([0.0, 0.07])
+    some = limits(-0.1, 0.15, 0.0, 6)
+    some.low[:2] = some.high[:2] = fixed
+    x = solve(columns.T @ columns, columns.T @ wanted, some)
+    np.testing.assert_array_equal(x[:2], fixed)
+    slow = lsq_linear(columns[:, 2:], wanted - columns[:, :2] @ fixed, (-0.1, 0.15), tol=1e-12).x
+    np.testing.assert_allclose(x[2:], slow, atol=1e-6)
+    some.low[:] = some.high[:] = 0.02
+    np.testing.assert_allclose(solve(columns.T @ columns, columns.T @ wanted, some), 0.02)
+
+
+def test_columns_that_say_the_same_but_for_rounding_are_no_crash() -> None:
+    """Their products, summed in float32, can be indefinite by more than the prior holds."""
+    matrix = 1e8 * np.array([[1.0, 1.0 + 5e-8, 0.0], [1.0 + 5e-8, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    assert np.linalg.eigvalsh(matrix).min() < -1.0
+    x = solve(matrix, 1e8 * np.array([0.3, 0.3, 0.2]), limits(-1.0, 1.0, 1e-6, 3))
+    np.testing.assert_allclose([x[0] + x[1], x[2]], [0.3, 0.2], atol=1e-5)
+    with pytest.raises(np.linalg.LinAlgError, match="by far more than their rounding"):
+        solve(np.array([[1.0, 2.0], [2.0, 1.0]]), np.zeros(2), limits(-1.0, 1.0, 1e-9, 2))
 
 
 def test_max_t_calls_nothing_significant_more_often_than_it_says() -> None:
