@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import zipfile
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -378,7 +378,7 @@ def test_what_cannot_be_had_is_missing_with_a_reason(recordings: list[Recording]
 def test_the_report_is_text_and_json_and_a_page_per_joint(result: FitResult, tmp_path: Path) -> None:
     import json
 
-    assert json.loads(json.dumps(result.report.as_dict()))["cells"][0]["joint"] == "FR_hip"
+    assert json.loads(json.dumps(asdict(result.report)))["cells"][0]["joint"] == "FR_hip"
     lines = text(result.report).splitlines()
     row = next(line for line in lines if line.startswith("all") and " all " in line)
     assert f"{result.report.cell().rmse['net']:.4f}*" in row

@@ -34,15 +34,7 @@ def test_why_what_removes_half_of_a_gap_is_rejected(gain: tuple[float, ...], p: 
     one: dict[str, Any] = {"after": [0.33], "gain": np.array([gain]), "p": np.array([p]), "share": np.array([0.52])}
     no, shown = np.array([False]), np.array([p < 0.01])
     trial = Trial(
-        ["viscous"],
-        **one,
-        sizes=np.array([2.7]),
-        needed=0.1,
-        shown=shown,
-        helps=no,
-        alias=no,
-        aside=no,
-        chosen=None,
+        ["viscous"], **one, sizes=np.array([2.7]), needed=0.1, shown=shown, helps=no, alias=no, aside=no, chosen=None
     )
     assert trial.reason(0) == ("rejected", why)
 
@@ -71,11 +63,7 @@ class Stub:
 
 
 def why(
-    search: Stub,
-    effect: str = "coulomb",
-    value: float = 0.3,
-    adequate: bool = False,
-    check: LastCheck = BORNE_OUT,
+    search: Stub, effect: str = "coulomb", value: float = 0.3, adequate: bool = False, check: LastCheck = BORNE_OUT
 ) -> str:
     theta = {(effect, "bound" if effect == "coulomb" else "offset"): np.full(4, value)}
     return doubt(search, effect, theta, JOINTS, adequate, check)  # type: ignore[arg-type]

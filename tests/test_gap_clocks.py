@@ -136,9 +136,7 @@ def test_of_speeds_that_are_wrong_the_written_times_are_taken(
     assert choice.errors["recorded"] < choice.errors["speeds"]
 
 
-def test_where_both_clocks_are_right_nothing_is_decided_and_that_is_said(
-    motions: list[tuple[np.ndarray, ...]],
-) -> None:
+def test_where_both_clocks_are_right_nothing_is_decided_and_that_is_said(motions: list[tuple[np.ndarray, ...]]) -> None:
     _, choice = clock_taken(logs(motions), pendulum(), QUICK)
     assert choice is not None
     assert (choice.taken, choice.decided) == ("recorded", False)

@@ -77,14 +77,7 @@ def test_the_loop_ends_for_a_reason(
     turns: list[Any] = []
     anything: Any = None
     rows = stage_loop.loop(
-        anything,
-        [anything],
-        anything,
-        anything,
-        GapSettings(),
-        DesignSettings(),
-        rounds,
-        turns.append,
+        anything, [anything], anything, anything, GapSettings(), DesignSettings(), rounds, turns.append
     )
     assert rows[-1].ended == ended
     assert len(rows) == len(verdicts) == len(made) == len(turns)

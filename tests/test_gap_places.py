@@ -157,10 +157,7 @@ def test_of_equals_that_mean_the_same_the_one_at_fewer_joints_comes_first(
     ],
 )
 def test_where_the_gap_is_small_what_is_easily_taken_for_another_is_named_with_it(
-    gains: tuple[float, float],
-    numbers: tuple[tuple[float, float], ...],
-    chosen: int,
-    alias: tuple[bool, bool],
+    gains: tuple[float, float], numbers: tuple[tuple[float, float], ...], chosen: int, alias: tuple[bool, bool]
 ) -> None:
     noise = np.random.default_rng(0).normal(0.0, 0.01, 60)
     gain = np.array(gains)[:, None] + noise

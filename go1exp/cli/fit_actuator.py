@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -100,7 +101,7 @@ def _task(container: dict[str, Any]) -> None:
         raise
     result.net.save(out / "net.npz")
     result.net.export_onnx(out / "net.onnx")
-    write_json(out / "report.json", result.report.as_dict())
+    write_json(out / "report.json", asdict(result.report))
     pictures = fitting.plot(result, out) if settings.plots else []
     print(report.text(result.report))
     print(f"\nwritten to {out}: net.npz, net.onnx, report.json{''.join(f', {p.name}' for p in pictures)}")

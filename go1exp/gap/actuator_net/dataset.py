@@ -207,10 +207,7 @@ class Split:
 
 
 def split(
-    recordings: Sequence[Recording],
-    holdout: float | tuple[str, ...],
-    validation: float | tuple[str, ...],
-    seed: int,
+    recordings: Sequence[Recording], holdout: float | tuple[str, ...], validation: float | tuple[str, ...], seed: int
 ) -> Split:
     """Divide whole episodes among the three parts; an episode and its repeats (``repeat_of``) stay together.
 

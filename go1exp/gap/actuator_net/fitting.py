@@ -177,10 +177,7 @@ def _references(
 ) -> list[Reference]:
     """Return what the net is compared with, on the held-out rows."""
     training, held_out = shares["train"], shares["held_out"]
-    references = [
-        *recorded(held_out.rows),
-        linear(training.rows, training.group, held_out.rows, held_out.group),
-    ]
+    references = [*recorded(held_out.rows), linear(training.rows, training.group, held_out.rows, held_out.group)]
     if not settings.half_net:
         return [*references, Reference("half_net", None, "half_net is off")]
     hidden = tuple(max(1, width // 2) for width in settings.hidden)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 
@@ -161,10 +160,6 @@ class Report:
             if (cell.joint, cell.regime) == (joint, regime):
                 return cell
         raise KeyError(f"{joint}, {regime}")
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain lists, dicts, strings and numbers, ready for JSON."""
-        return asdict(self)
 
 
 def rmse(error: np.ndarray) -> float:

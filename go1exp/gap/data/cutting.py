@@ -96,14 +96,14 @@ def _start(
     return cubic[0], cubic[1], 2.0 * cubic[2], misfit
 
 
-def _changes(t: np.ndarray, values: np.ndarray, lo: float, hi: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return when (E,) and to what (E, ...) a held signal changes between two times, the first in force at ``lo``."""
-    first = max(int(np.searchsorted(t, lo + 1e-9, side="right")) - 1, 0)
+def _changes(t: np.ndarray, values: np.ndarray, begin: float, hi: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return when (E,), s since ``begin``, and to what (E, ...) a held signal changes; the past first, until ``hi``."""
+    first = max(int(np.searchsorted(t, begin - PAST_S + 1e-9, side="right")) - 1, 0)
     last = int(np.searchsorted(t, hi, side="right"))
     part = values[first:last]
     moved = np.ones(len(part), dtype=bool)
     moved[1:] = np.any((part[1:] != part[:-1]).reshape(len(part) - 1, -1), axis=1)
-    return t[first:last][moved], part[moved]
+    return t[first:last][moved] - begin, part[moved]
 
 
 def bridged(t: np.ndarray, target: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -215,7 +215,7 @@ class _Cutter:
 
     def _window(self, track: _Track, begin: float, place: Place, state: tuple[np.ndarray, ...]) -> dict[str, Any]:
         """Return the window at ``place`` that begins at ``begin``, s, in ``state``."""
-        t, first, end = track.t, begin - PAST_S, begin + self.length
+        t, end = track.t, begin + self.length
         shown = (t >= begin + self.settings.burn_s - 1e-9) & (t <= min(end, place.end) + 1e-9)
         inside = np.flatnonzero(shown)[: self.samples]
         q, qd, qdd, misfit = state
@@ -234,8 +234,8 @@ class _Cutter:
             "y": _padded(track.y[inside], self.samples),
             "valid": _padded(np.ones(len(inside), dtype=bool), self.samples),
             "scale": np.where(place.compared(self.sd.shape[1]), self.sd, np.inf),
-            "edges": _since(begin, _changes(track.stamps, track.targets, first, end)),
-            "switches": _since(begin, _changes(t, track.enabled, first, end)),
+            "edges": _changes(track.stamps, track.targets, begin, end),
+            "switches": _changes(t, track.enabled, begin, end),
         }
 
 
@@ -294,10 +294,6 @@ def cut(
         length=cutter.length + 1e-9,
         **plain,
     )
-
-
-def _since(begin: float, changes: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    return changes[0] - begin, changes[1]
 
 
 def _padded(values: np.ndarray, rows: int) -> np.ndarray:

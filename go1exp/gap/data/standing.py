@@ -260,8 +260,7 @@ def _with_trunk(
             contact[k] = bearing[number][rows]
             base = bases[number, begin]
             state[k], base_sd[k, 3:6] = base.state, np.hypot(base_sd[k, 3:6], 0.5 * base.slide)
-    kept = {f.name: getattr(plain, f.name) for f in dataclasses.fields(plain)}
-    kept |= {"quantities": (*plain.quantities, IMU), "y": np.concatenate([plain.y, imu], axis=2)}
+    kept = vars(plain) | {"quantities": (*plain.quantities, IMU), "y": np.concatenate([plain.y, imu], axis=2)}
     kept["scale"] = np.concatenate([plain.scale, scale], axis=1)
     held = np.array([number not in logs for number in plain.episode])
     return StandingWindows(**kept, base=state, sd_of_base=base_sd, contact=contact, held=held, imu_site=legs.imu_site)

@@ -178,8 +178,7 @@ def cut_swings(recordings: Sequence[Recording], settings: GapSettings, config: R
         motion = motions[number]
         near = (motion.t > begin - AROUND_S) & (motion.t < begin + plain.length + AROUND_S)
         carried.append((motion.t[near] - begin, motion.values[near]))
-    kept = {f.name: getattr(plain, f.name) for f in dataclasses.fields(plain)}
-    return SwingWindows(**kept | {"scale": scale}, carried=tuple(carried))
+    return SwingWindows(**vars(plain) | {"scale": scale}, carried=tuple(carried))
 
 
 def _noise_in_air(

@@ -137,7 +137,7 @@ def _bent(score: Scorer, plain: Rows, dt: float) -> Scorer:
     joints, coordinates = len(windows.joints), 2 * len(windows.joints) + windows.base_sd.shape[1]
     everything = np.arange(len(windows))
     nominal = replayer.run(plain, dt)
-    _, root = solved(score.state[:, 0], np.zeros(score.state.shape[::2][:1] + score.state.shape[2:3]))
+    _, root = solved(score.state[:, 0], np.zeros((len(windows), score.state.shape[2])))
     sd = np.concatenate([windows.q_sd, windows.qd_sd, windows.base_sd], axis=1)
     rng, square = np.random.default_rng(0), np.zeros_like(score.scale)
     for _ in range(DRAWS):

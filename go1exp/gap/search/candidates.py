@@ -266,8 +266,7 @@ def _choice(
     # Of those that mean the same the one with the fewest values comes first: four lighter links imitate one rotor.
     same = alias if (alias & unclear).any() else equal
     order = sorted(
-        np.flatnonzero(alias).tolist(),
-        key=lambda k: (0, *numbers[k], -mean[k]) if same[k] else (1, 0, 0, -mean[k]),
+        np.flatnonzero(alias).tolist(), key=lambda k: (0, *numbers[k], -mean[k]) if same[k] else (1, 0, 0, -mean[k])
     )
     chosen = int(order[0])
     if inside.any() and mean[inside].max() >= mean[chosen] - significance.same(mean[chosen]):

@@ -188,12 +188,7 @@ class Screened:
 
 
 def screen(
-    scorer: Scorer,
-    theta: Theta,
-    present: Table,
-    may: tolerances.Freedom,
-    library: Sequence[Variant],
-    dt: float,
+    scorer: Scorer, theta: Theta, present: Table, may: tolerances.Freedom, library: Sequence[Variant], dt: float
 ) -> list[Screened]:
     """Rank variants by a linear model that adds their columns to those of ``present``, about the values ``theta``."""
     every = [p for v in library for p in v.probes]
@@ -312,15 +307,11 @@ def _columns(scorer: Scorer, theta: Theta, windows: np.ndarray, probes: Sequence
             lots[-1] += members
         else:
             lots.append(list(members))
-    columns = np.zeros((len(windows), len(machine.groups), *_sizes(scorer), len(probes)), dtype=np.float32)
+    values = scorer.windows.t.shape[1] * len(scorer.windows.quantities) * len(machine.groups[0])
+    columns = np.zeros((len(windows), len(machine.groups), values, len(probes)), dtype=np.float32)
     for lot in lots:
         chosen = [probes[k] for k in lot]
         rows = variants(machine, theta, windows, chosen)
         y = replayer.run(rows, 2.0 * dt).reshape(len(windows), 1 + len(chosen), *scorer.windows.y.shape[1:])
         columns[..., lot] = differences(scorer, y, windows, chosen)
     return columns
-
-
-def _sizes(scorer: Scorer) -> tuple[int]:
-    w = scorer.windows
-    return (w.t.shape[1] * len(w.quantities) * len(scorer.replayer.machine.groups[0]),)

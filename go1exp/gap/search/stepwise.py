@@ -242,12 +242,7 @@ def fitted_on(search: Search, fitted: Sequence[Model]) -> list[Model]:
 
 
 def held_out_test(
-    search: Search,
-    fitted: Sequence[Model],
-    state: State,
-    train: np.ndarray,
-    select: np.ndarray,
-    small: bool = False,
+    search: Search, fitted: Sequence[Model], state: State, train: np.ndarray, select: np.ndarray, small: bool = False
 ) -> tuple[Search, Model | None, Model | None]:
     """Test fitted candidates on held-out windows, by the chi2 (V, G) of the present model there and in the fit.
 

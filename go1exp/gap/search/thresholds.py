@@ -32,7 +32,7 @@ CONVERGED_SHARE = 0.01  # the same as a share of log chi2: beside a large error 
 GOOD_FIT = 0.01  # log chi2 below which a model without terms needs no more rounds
 STEPS_PER_ROUND = 2  # most Gauss-Newton steps before the Jacobian is measured again
 FINER_STEPS = 4  # substeps of a physics step in the last fit: errors of 1 ms steps can look like 0.4 ms of delay
-NOT_EXCITED = 0.02  # Chi2 added in every window, at twice its tolerance, below which an effect is not excited
+NOT_EXCITED = 0.02  # chi2 added in every window, at twice its tolerance, below which an effect is not excited
 SCREENED_WINDOWS = 20  # most windows of the screening
 # Most rounds of fitting of a rival of an effect at its bound, which begins at a small part of its size.
 RIVAL_ROUNDS = 4
@@ -54,16 +54,14 @@ SIGN_FLIPS = 4000  # sign flips of a test; the smallest p-value is 1 / (SIGN_FLI
 SAME_GAIN = 0.02  # difference of gains of log chi2 without meaning: 2 % of the floor, or of the larger gain
 WORSE_P = 0.05  # p-value below which a model is worse than another
 EQUAL_SHARE = 0.7  # share of the best gain below which a model is no equal, however uncertain
-# Factor on ``alpha`` for a candidate that removes ``LARGE_SHARE``: three of three such were right on sealed cases.
-LARGE_ALPHA = 10.0
+LARGE_ALPHA = 10.0  # factor on ``alpha`` for a candidate that removes ``LARGE_SHARE``
 LARGE_SHARE = 0.75  # share of the excess chi-squared that only the right effect, or one that acts alike, removed
 
 # ---------------------------------------------------------------------- the last fit and its intervals
 
 FEWEST_BOOTSTRAPS = 20  # fewest resamples from which an interval is read
 LAST_STEPS = 4  # Gauss-Newton steps of the last fit, whose residuals are those of a finer physics step
-# Relative standard deviation of a value because no robot follows a law exactly: 89 % of 265 sealed values covered.
-LAW_SD = 0.04
+LAW_SD = 0.04  # relative standard deviation of a value, as no robot follows a law exactly (from sealed cases)
 
 # ---------------------------------------------------------------------- at fewer joints
 
@@ -100,10 +98,8 @@ QUANTILES = (0.025, 0.975)  # quantiles of a 95 % interval
 BESIDE_GAP_SHARE = 0.75
 # Share of the excess chi-squared above which a term is not withdrawn, and that it must remove on the last check.
 HALF = 0.5
-# Share of the resamples for a term that closes a gap: all five sealed terms named in 60 to 78 % were right.
-MAJORITY = 0.5
-# Relative standard deviation per unit of the remaining error amplitude, from 84 sealed values beside a gap.
-BIAS_SD = 0.4
+MAJORITY = 0.5  # share of the resamples that a term needs which closes a gap (from sealed cases)
+BIAS_SD = 0.4  # relative standard deviation per unit of the error amplitude that remains (from sealed cases)
 HALF_WIDTH = 1.96  # half width of a 95 % interval, in standard deviations
 ACCEPTED_WINDOWS = 0.9  # share of the held-out windows that must be within what the user accepts (chosen)
 # Share of a term's largest deviation from which a joint is named although its interval reaches the tolerance.

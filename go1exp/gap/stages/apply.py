@@ -29,8 +29,8 @@ from go1exp.gap.score.likelihood import excess, removed
 from go1exp.gap.search.fit import scores
 from go1exp.logs.recording import Recording
 from go1exp.robot.config import RobotConfig
-from go1exp.sim.effects.base import Effect, Param
-from go1exp.sim.effects.tolerances import Tolerances
+from go1exp.sim.effects.base import Param
+from go1exp.sim.effects.tolerances import Tolerances, effect_class
 from go1exp.sim.task import parse_parts
 
 ROBOT = "robot"
@@ -140,17 +140,11 @@ def _value(places: Mapping[str, float], param: Param) -> str:
 def _params(effect: str, names: Collection[str]) -> dict[str, Param]:
     """Return the declarations of an effect by name, of which ``names`` must be some."""
     registered = effect in members("effect")
-    known = {p.name: p for p in _kind(effect).params} if registered else {}
+    known = {p.name: p for p in effect_class(effect).params} if registered else {}
     strange = [f"{effect}.{name}" for name in names if name not in known] if registered else [effect]
     if strange:
         raise GapFileError(f"{strange[0]}: not in the library; the result is of another version of go1exp")
     return known
-
-
-def _kind(effect: str) -> type[Effect]:
-    kind = members("effect")[effect].target
-    assert isinstance(kind, type)
-    return kind
 
 
 def _provenance(result: GapResult) -> list[str]:
@@ -194,7 +188,7 @@ def theta_of(terms: Sequence[Term], joints: Sequence[str]) -> Theta:
     """Return the values of effects per joint (J,), or (1,) for one of the robot, by (effect, parameter)."""
     theta: Theta = {}
     for term in terms:
-        for p in _kind(term.entry.name).params:
+        for p in effect_class(term.entry.name).params:
             given = term.parameters[p.name]
             full = np.array([float(given)]) if p.per == ROBOT else np.nan_to_num(spread(given, joints), nan=p.null)
             theta[term.entry.name, p.name] = full

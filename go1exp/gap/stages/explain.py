@@ -152,12 +152,7 @@ def searched(comparison: Comparison, rng: np.random.Generator, warnings: list[st
 
 
 def written(
-    comparison: Comparison,
-    search: Search,
-    answer: Answer,
-    about: dict[str, Any],
-    warnings: Sequence[str],
-    start: float,
+    comparison: Comparison, search: Search, answer: Answer, about: dict[str, Any], warnings: Sequence[str], start: float
 ) -> GapResult:
     """Return the result: the answer, the evidence behind it, and where the model is wrong with and without it."""
     score, parts, settings, dt = search.state.scorer, search.splits, search.settings, search.dt
