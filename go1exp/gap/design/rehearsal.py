@@ -191,8 +191,8 @@ def _later(recording: Recording, seconds: float) -> Recording:
     return Recording(recording.meta, {name: values[keep] for name, values in recording.channels.items()})
 
 
-def table(played: Rehearsal, joints: tuple[str, ...], period: float) -> str:
-    """Return a design as a CSV: t in s, targets in rad, gains in N m/rad and N m s/rad, and whether drives are on.
+def write(played: Rehearsal, joints: tuple[str, ...], period: float, path: Path) -> Path:
+    """Write a design as a CSV: t in s, targets in rad, gains in N m/rad and N m s/rad, and whether drives are on.
 
     ``go1exp record`` plays it as the excitation ``playback``, and takes the gains from its own setting ``gains``.
     """
@@ -204,11 +204,6 @@ def table(played: Rehearsal, joints: tuple[str, ...], period: float) -> str:
     lines = [",".join([*names, FLAG])]
     for row, on in zip(values, played.motion.torque_enable, strict=True):
         lines.append(",".join([f"{row[0]:.6f}", *(f"{v:.5f}".rstrip("0").rstrip(".") for v in row[1:]), str(int(on))]))
-    return "\n".join(lines) + "\n"
-
-
-def write(played: Rehearsal, joints: tuple[str, ...], period: float, path: Path) -> Path:
-    """Write a design and return its file."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, table(played, joints, period))
+    write_text(path, "\n".join(lines) + "\n")
     return path

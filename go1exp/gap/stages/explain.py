@@ -229,29 +229,17 @@ def overlays(
     order = np.argsort(-off)
     picked = order[np.unique(np.linspace(0, len(order) // 2, count).astype(int))]
     after = score.replayer.run(variants(machine, theta, windows[picked], []), dt)
-    drawn = []
     known = [at for at in w.channels if np.isfinite(w.scale[windows][:, *at[1:]]).any()]
-    for row, k in enumerate(picked):
-        window = windows[k]
+    drawn = []
+    for k, window, of_fitted in zip(picked, windows[picked], after, strict=True):
         valid = w.valid[window]
-        compared = [at for at in known if np.isfinite(w.scale[window][at[1:]])]
-
-        def curves(
-            y: np.ndarray, channels: Sequence[tuple[str, int, int]] = compared, valid: np.ndarray = valid
-        ) -> dict[str, np.ndarray]:
-            return {name: y[valid, c, i] for name, c, i in channels}
-
-        noise = {name: float(w.scale[window, c, i]) for name, c, i in compared}
-        drawn.append(
-            Overlay(
-                recordings[w.episode[window]].meta.episode,
-                w.begin[window] + w.t[window, valid],
-                curves(w.y[window], known),
-                curves(before[k]),
-                curves(after[row]),
-                noise,
-            )
+        noise = {name: float(w.scale[window, c, i]) for name, c, i in known if np.isfinite(w.scale[window, c, i])}
+        measured = {name: w.y[window, valid, c, i] for name, c, i in known}
+        plain, fitted = (
+            {name: y[valid, c, i] for name, c, i in known if name in noise} for y in (before[k], of_fitted)
         )
+        episode, t = recordings[w.episode[window]].meta.episode, w.begin[window] + w.t[window, valid]
+        drawn.append(Overlay(episode, t, measured, plain, fitted, noise))
     return tuple(drawn)
 
 
