@@ -39,12 +39,7 @@ USABLE = 0.5  # share of the windows that must be without holes by a clock for i
 
 
 class NotComparable(Expected):
-    """Recordings that cannot be compared with a robot.
-
-    Attributes:
-        flaws: why, a line each.
-        warnings: what a reader must know, a sentence each.
-    """
+    """Recordings that cannot be compared with a robot: why, a line each, and what a reader must know, in sentences."""
 
     def __init__(self, sentence: str, flaws: Sequence[str], warnings: Sequence[str]) -> None:
         """Take the reason as one ``sentence`` and as lines."""
@@ -155,19 +150,13 @@ def compare(
     physics_dt: float | None = None,
     fewest: int = FEWEST_WINDOWS,
 ) -> Comparison:
-    """Prepare recordings, cut them into windows, and measure the floors.
+    """Prepare recordings of one robot, cut them into windows, and measure the floors.
 
     Where the model leaves open which clock they are read by, that is decided first, which takes as long
-    as four short searches.
+    as four short searches. At least ``fewest`` windows are needed.
 
-    Args:
-        recordings: of one robot.
-        robot: the model.
-        settings: the user's.
-        on_progress: called with what is being done, and which share of the work is finished.
-        physics_dt: longest step of the simulation, s, to score at exactly that step; that of the settings if None, for
-            which the influence of initial states may be measured at twice the step.
-        fewest: windows that are needed.
+    ``physics_dt`` is the longest step of the simulation, s, to score at exactly that step. None takes that of the
+    settings, for which the influence of initial states may be measured at twice the step.
 
     Raises:
         NotComparable: if the recordings do not suit the robot, or are too short.

@@ -296,14 +296,10 @@ class SmoothMotion:
 
 
 def smooth_motion(recording: Recording, window: float = WINDOW) -> SmoothMotion:
-    """Differentiate the measured angles with a Savitzky-Golay filter (third order, symmetric: no lag).
+    """Differentiate the measured angles with a Savitzky-Golay filter of ``window`` s (third order, symmetric: no lag).
 
     The angles are resampled linearly to the median step of the clock, filtered, and read off at the recording's own
     time stamps. Only ``q`` is used: the ``qd`` of an actuator has already been filtered.
-
-    Args:
-        recording: any with ``q``.
-        window: length of the filter, s.
 
     Raises:
         FitError: if the window holds fewer than ORDER + 2 samples or the recording is shorter than it.

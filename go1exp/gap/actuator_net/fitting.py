@@ -62,13 +62,9 @@ def fit(
     on_progress: OnProgress | None = None,
     joint_torque: JointTorque | None = None,
 ) -> FitResult:
-    """Train an actuator net and report on the episodes that were held out.
+    """Train an actuator net on recordings of one robot and report on the episodes that were held out.
 
-    Args:
-        recordings: of one robot, one episode each.
-        settings: how to fit.
-        on_progress: called after every epoch.
-        joint_torque: torque at the joints of a recording, for ``settings.target = "joint_torque"``.
+    ``on_progress`` is called after every epoch; ``joint_torque`` is for ``settings.target = "joint_torque"``.
 
     Raises:
         FitError: if recordings do not fit together, or there are too few.

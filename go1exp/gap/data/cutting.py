@@ -245,17 +245,11 @@ def cut(
     doubt: Callable[[int, float], float] = lambda number, at: 0.0,
     places: Sequence[Sequence[Place]] | None = None,
 ) -> Windows:
-    """Cut recordings of one robot into windows.
+    """Cut recordings of one robot into windows, one stride apart or at ``places`` of each recording.
 
     A window begins where the motion is smooth, within a third of a stride of where it should, since its initial state
-    comes from smoothing. Windows with holes are left out.
-
-    Args:
-        recordings: of one robot.
-        settings: lengths of windows.
-        doubt: what to add to the misfit of an initial state of recording ``number`` at time ``at``, s; where it is
-            infinite, no window begins.
-        places: of the windows of each recording; one stride apart if None.
+    comes from smoothing. Windows with holes are left out. ``doubt`` returns what to add to the misfit of an initial
+    state of a recording (number) at a time, s; where it is infinite, no window begins.
 
     Raises:
         RecordingError: if not one window fits.

@@ -111,11 +111,9 @@ def on_feet(recordings: Sequence[Recording]) -> list[Recording]:
 
 
 def contact_of(recordings: Sequence[Recording], chosen: ContactConfig | None) -> ContactConfig:
-    """Return the contact of the model that recordings are compared with.
+    """Return the contact of the model that recordings of one robot are compared with.
 
-    Args:
-        recordings: of one robot.
-        chosen: by the user; None takes the one that recordings on the ground name, or MuJoCo's own if none does.
+    That is the ``chosen`` one, else the one that recordings on the ground name, or MuJoCo's own if none does.
 
     Raises:
         ConfigError: if they name different ones and none is chosen.

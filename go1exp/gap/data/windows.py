@@ -203,19 +203,14 @@ def _kept_whole(kinds: Sequence[tuple[object, ...]], wanted: int, rng: np.random
 
 
 def splits(metas: Sequence[Meta], episode: np.ndarray, confirm: float, rng: np.random.Generator) -> Splits:
-    """Split windows by episode, or within an episode of which there is only one of its kind.
+    """Split windows, whose recordings are ``episode`` (W,), by episode, or within one that is the only one of its kind.
 
     What only one episode shows cannot be fitted if that episode is for tests, nor tested if it is fitted.
     So of episodes of one motion and gain set half are fitted and half tested; one that is alone is cut into
     stretches of three windows, which take turns. For the last check whole episodes are kept of motions of which there
-    are more; if those are fewer than ``confirm`` asks for, every fifth stretch of episodes that are alone is. An
-    episode and its repetition count as one.
-
-    Args:
-        metas: of the recordings.
-        episode: (W,) recording of each window.
-        confirm: share for the last check; of fewer than four episodes none whole, and none of short ones.
-        rng: of what goes where.
+    are more; if those are fewer than the share ``confirm`` asks for, every fifth stretch of episodes that are alone
+    is. Of fewer than four episodes none is kept whole, and of short ones no stretch. An episode and its repetition
+    count as one.
     """
     shown, episode = np.unique(episode, return_inverse=True)  # one without any window can be neither tested nor fitted
     metas = [metas[k] for k in shown]

@@ -98,16 +98,10 @@ class Worth:
 def power(distance: float, gain: float, same: float, values: float, spread: float, alpha: float) -> float:
     """Return the chance to separate two explanations, averaged over the size of the true one.
 
-    With the truth, the log likelihood ratio (twice) is normal about T with variance 4 T; with the rival about -T. It
-    must exceed what the rival would reach in ``alpha`` of cases, and ``same`` per value on average.
-
-    Args:
-        distance: T.
-        gain: mean difference of log chi2 without noise.
-        same: difference that counts as none.
-        values: number of values that were compared.
-        spread: relative standard deviation of the true size; T grows with its square.
-        alpha: level of the test.
+    With the truth, the log likelihood ratio (twice) is normal about T (``distance``) with variance 4 T; with the rival
+    about -T. It must exceed what the rival would reach in ``alpha`` of cases. The mean difference of log chi2 without
+    noise (``gain``) of that many ``values`` must exceed what counts as the ``same``. ``spread`` is the relative
+    standard deviation of the true size; T grows with its square.
     """
     total = 0.0
     for node, weight in zip(NODES, WEIGHTS / WEIGHTS.sum(), strict=True):

@@ -132,16 +132,10 @@ class Limits:
 
 
 def limits_of(robot: Robot, windows: Windows, targets: Sequence[np.ndarray], safety: Safety) -> Limits:
-    """Return the limits of a robot.
+    """Return the limits of a robot, by targets (T, J), rad, of each of the recordings at hand and the user's shares.
 
     Motions are about the middle of the targets at hand, in which the robot has been. A joint whose model has no stops
     may go where it has been in the recordings.
-
-    Args:
-        robot: whose base is held.
-        windows: of the recordings at hand.
-        targets: of each of them (T, J), rad.
-        safety: the user's shares.
 
     Raises:
         DesignError: if the robot's base is not held.

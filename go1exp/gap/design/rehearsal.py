@@ -53,14 +53,7 @@ class Rehearsal:
 
 @dataclass
 class Stage:
-    """Where designs are rehearsed: the robot and the recordings at hand.
-
-    Attributes:
-        comparison: of the recordings at hand.
-        limits: of motions.
-        theta: values of the model.
-        seconds: length of a design, s.
-    """
+    """Where designs, ``seconds`` s long, are rehearsed: the recordings at hand, limits, and values of the model."""
 
     comparison: Comparison
     limits: Limits

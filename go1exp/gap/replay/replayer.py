@@ -24,14 +24,9 @@ LEVEL = (1.0, 0.0, 0.0, 0.0)  # attitude of a trunk that is held level, w-x-y-z
 
 @dataclass
 class Replayer:
-    """Runs the model through windows; keeps its batches of simulations for the next call.
+    """Runs the model through windows, ``max_rows`` side by side; keeps its batches of simulations for the next call.
 
-    Attributes:
-        machine: the robot.
-        windows: what to replay.
-        quats: (W, 4) attitude of the base.
-        max_rows: simulations side by side.
-        threads: of the engine.
+    ``quats`` (W, 4) are attitudes of a base that is held, w-x-y-z; ``threads`` are the engine's.
     """
 
     machine: Machine

@@ -52,14 +52,10 @@ class Machine(Protocol):
     def build(
         self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False
     ) -> tuple[Any, ActuatorSetup]:
-        """Return a backend with ``num`` robots, and their drives.
+        """Return a backend with ``num`` robots that steps by ``physics_dt`` s, and their drives.
 
-        Args:
-            num: of the robots.
-            physics_dt: step, s.
-            base_quat: attitude of a held base, w-x-y-z.
-            threads: of the engine.
-            mounted: a held base has the joints of ``sim/physics/scene.py``; nothing to one that is free.
+        A base that is held has the attitude ``base_quat``, w-x-y-z, and if ``mounted`` the joints of
+        ``sim/physics/scene.py``. Neither means anything to one that is free.
         """
 
 

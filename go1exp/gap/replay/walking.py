@@ -78,12 +78,7 @@ def beside(joints: np.ndarray, series: np.ndarray, at: np.ndarray) -> np.ndarray
 
 @dataclass
 class StandingReplayer(Replayer):
-    """Replays windows of a standing robot, and those of the same robot suspended.
-
-    Attributes:
-        held: the same robot with its trunk held.
-        suspended: replays its windows; made where there are some.
-    """
+    """Replays windows of a standing robot; those of the same robot ``held`` are replayed by ``suspended``."""
 
     windows: StandingWindows
     held: Machine = field(kw_only=True)

@@ -217,13 +217,7 @@ def would_change(result: GapResult) -> list[str]:
 
 @dataclass(frozen=True)
 class Next:
-    """A recording to make next.
-
-    Attributes:
-        why: purpose.
-        command: for a shell.
-        effects: that it excites.
-    """
+    """A recording to make next: its purpose, the command for a shell, and the effects that it excites."""
 
     why: str
     command: str

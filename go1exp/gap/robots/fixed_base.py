@@ -60,18 +60,7 @@ class TorqueDrive(Gains):
 
 @dataclass(frozen=True)
 class FixedBase:
-    """A robot of hinges on a fixed base.
-
-    Attributes:
-        config: its description.
-        joints: names, as recordings have them.
-        groups: numbers of the joints that move together.
-        effort: peak torque (J,), N m.
-        top_speed: (J,) rad/s.
-        tolerances: of nominal parameters.
-        base_probe: none.
-        on_ground: no.
-    """
+    """A robot of hinges on a fixed base: its description, its ``top_speed`` (J,), rad/s, and what a ``Machine`` says."""
 
     config: ModelConfig
     joints: tuple[str, ...]
@@ -296,13 +285,9 @@ def completed(recording: Recording, config: ModelConfig, speeds: bool) -> Record
 def robot_of(
     model: ModelConfig | Go1Model, config: RobotConfig, path: str = "model", contact: ContactConfig | None = None
 ) -> Robot:
-    """Return the robot of a description; the Go1 is ``config``, suspended.
+    """Return the robot of a description, which messages call ``path``; the Go1 is ``config``, suspended.
 
-    Args:
-        model: the description.
-        config: of the Go1.
-        path: key of the description, for messages.
-        contact: of a Go1's feet, if one was chosen.
+    ``contact`` is of a Go1's feet, if one was chosen.
 
     Raises:
         ConfigError: naming the key, if its MuJoCo file does not suit it, or a contact was chosen for a fixed base.

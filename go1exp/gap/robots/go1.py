@@ -55,17 +55,7 @@ ON_MUJOCO = DECLARED.on(MUJOCO_CONTACT)
 
 @dataclass(frozen=True)
 class Go1:
-    """Base of the Go1's kinds of comparison.
-
-    Attributes:
-        config: of the robot.
-        joints: names.
-        groups: joints that feel each other.
-        base_probe: as for :class:`~go1exp.gap.replay.rows.Machine`.
-        on_ground: whether it stands.
-        tolerances: of nominal parameters.
-        free_trunk: whether its trunk moves.
-    """
+    """Base of the Go1's kinds of comparison, which differ in what a ``Machine`` says and in whether the trunk moves."""
 
     config: RobotConfig
     joints: tuple[str, ...] = robot.JOINTS
@@ -132,12 +122,9 @@ class Go1:
 
 @dataclass(frozen=True)
 class StandingGo1(Go1):
-    """A Go1 that stands or moves on flat ground, its trunk free.
+    """A Go1 that stands or moves on flat ground, its trunk free; tolerances are about the values of its contact.
 
-    Attributes:
-        held: the same robot with its trunk held, for recordings of it that were made so.
-        tolerances: of nominal parameters, about the values of this contact.
-        contact: of the feet.
+    ``held`` is the same robot with its trunk held, for recordings of it that were made so.
     """
 
     base_probe: tuple[float, ...] = BASE_PROBE
@@ -198,8 +185,7 @@ class SwingingGo1(Go1):
 class SuspendedGo1(Go1):
     """A Go1 whose trunk is held, so that its legs do not feel each other.
 
-    Attributes:
-        contact: of its feet where it stands in a recording; None takes the one that recordings name.
+    ``contact`` is of its feet where it stands in a recording; None takes the one that recordings name.
     """
 
     groups: tuple[tuple[int, ...], ...] = LEGS

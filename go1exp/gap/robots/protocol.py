@@ -36,11 +36,7 @@ class Robot(Machine, Protocol):
         """
 
     def replayer(self, windows: Windows, quats: np.ndarray, max_rows: int, threads: int) -> Replayer:
-        """Return what runs this robot through windows.
+        """Return what runs this robot through windows that it cut, ``max_rows`` side by side.
 
-        Args:
-            windows: that this robot cut.
-            quats: (W, 4) attitude of a base that is held, w-x-y-z.
-            max_rows: simulations side by side.
-            threads: of the engine.
+        ``quats`` (W, 4) are attitudes of a base that is held, w-x-y-z; ``threads`` are the engine's.
         """

@@ -65,13 +65,7 @@ def _mean_square(score: Scorer, residual: np.ndarray) -> np.ndarray:
 def converged(
     replayer: Replayer, dt: float, clock_s: float, theta: Theta | None = None
 ) -> tuple[Scorer, dict[str, float]]:
-    """Move the windows' initial states to where they fit best.
-
-    Args:
-        replayer: of a standing robot.
-        dt: physics step, s.
-        clock_s: as for ``likelihood.scorer``.
-        theta: values of the model that they are to fit; the nominal one if None.
+    """Move the windows' initial states to where the model with values ``theta`` (none: nominal) fits best.
 
     Returns:
         The scorer of those windows, which does the same for other values, and the error of the step by quantity.
@@ -153,11 +147,8 @@ def _bent(score: Scorer, plain: Rows, dt: float) -> Scorer:
 def measured(replayer: Replayer, dt: float, coarse: float, clock_s: float) -> tuple[Scorer, dict[str, float]]:
     """Return what scores replays at step ``dt``, s, and the error of that step by quantity.
 
-    Args:
-        replayer: of the windows.
-        dt: physics step, s.
-        coarse: step, s, at which the influence of the initial states of a held robot is measured.
-        clock_s: standard deviation of the time between stamps of commands and of readings, s.
+    The influence of the initial states of a held robot is measured at the step ``coarse``, s. ``clock_s`` is the
+    standard deviation of the time between stamps of commands and of readings, s.
     """
     if replayer.machine.on_ground:  # initial states of a free trunk matter so much that they are fitted first
         return converged(replayer, dt, clock_s)

@@ -183,12 +183,8 @@ def borrowed(known: Table, scorer: Scorer, theta: Theta, probes: Sequence[Probe]
 def corrected(linear: Table, layout: Layout, step: np.ndarray, unit: np.ndarray, residual: np.ndarray) -> Table:
     """Return columns that also say what a step did: the nearest to the present ones that do (Broyden, 1965).
 
-    Args:
-        linear: before the step.
-        layout: of its unknowns.
-        step: (size,) what was added to them.
-        unit: (size,) what counts as much for one unknown as for another, such as their tolerances.
-        residual: (V, G, m) after the step.
+    ``step`` (size,) was added to the unknowns, of which ``unit`` (size,) count alike, such as their tolerances;
+    ``residual`` (V, G, m) is that after the step.
     """
     columns = linear.columns.copy()
     for g, at in enumerate(layout.index):

@@ -196,18 +196,10 @@ def tried(
     rng: np.random.Generator,
     small: bool = False,
 ) -> Trial:
-    """Compare fitted candidates with the present model, whose chi2 on ``windows`` is ``now`` (V, G).
+    """Compare fitted candidates with the present model on ``windows`` that no fit has seen.
 
-    Args:
-        scorer: of the windows.
-        settings: the user's.
-        fitted: the candidates.
-        train: (T, G) chi2 of the present model on the windows of the fit.
-        now: the same on ``windows``.
-        windows: which no fit has seen.
-        dt: physics step, s.
-        rng: of the sign flips.
-        small: the gap is within the tolerances; which share of it a candidate removes means nothing.
+    The present model's chi2 is ``now`` (V, G) there, and ``train`` (T, G) on the windows of the fit. Where the gap is
+    ``small``, within the tolerances, which share of it a candidate removes means nothing.
     """
     chi2 = scores(scorer, [m.theta for m in fitted], windows, dt)
     gain = significance.gains(now, chi2)

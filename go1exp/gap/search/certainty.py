@@ -53,16 +53,12 @@ def resampled_values(search: Search) -> tuple[Theta, dict[Key, np.ndarray]]:
 def bootstrapped(
     state: State, linear: Table, chi2: np.ndarray, rng: np.random.Generator, count: int, nominal: bool
 ) -> Iterator[Theta]:
-    """Yield values of the model by bootstraps of episodes, to first order.
+    """Yield values of the model by ``count`` bootstraps of episodes, to first order.
 
-    Args:
-        state: the model; the columns are those about its values.
-        linear: of the windows that are resampled, about the values that are.
-        chi2: (V, G) per value there.
-        rng: of the bootstraps.
-        count: of bootstraps.
-        nominal: whether the nominal values are drawn, too. They are themselves uncertain by their tolerances, and
-            motion fixes many of them only relative to each other: that belongs into an interval.
+    ``linear`` is of the windows that are resampled, about the values that are; its columns are those about the values
+    of ``state``; ``chi2`` (V, G) per value is theirs. With ``nominal`` the nominal values are drawn, too. They are
+    themselves uncertain by their tolerances, and motion fixes many of them only relative to each other: that belongs
+    into an interval.
     """
     layout, theta = Layout.from_probes(state.machine, linear.probes), linear.theta
     grams = _grams(state, linear) / np.maximum(chi2, 1.0)[..., None, None]

@@ -48,16 +48,11 @@ def rows_of(windows: Windows, which: np.ndarray, recordings: Sequence[Recording]
 
 
 def beginnings(clocks: Sequence[np.ndarray], q: np.ndarray, settings: GapSettings, spared: np.ndarray) -> list[int]:
-    """Return rows of one recording at which windows may begin by every clock.
+    """Return rows of one recording at which windows may begin by every clock (times (T,), s, by each).
 
-    About one stride apart, where the motion is smooth within a third of it, as for windows of one clock. Smoothness is
-    computed from the rows alone, so that no clock has its way.
-
-    Args:
-        clocks: times (T,), s, by each.
-        q: angles (T, J), rad.
-        settings: lengths of windows.
-        spared: (T,) bool, rows that no window may have.
+    About one stride apart, where the motion of the angles ``q`` (T, J) is smooth within a third of it, as for windows
+    of one clock. Smoothness is computed from the rows alone, so that no clock has its way. No window has rows that are
+    ``spared`` (T,) bool.
     """
     length = settings.burn_s + settings.window_s
     bend = np.abs(np.diff(q, 3, axis=0, prepend=q[:1], append=q[-2:]))
@@ -150,12 +145,7 @@ def _shared(windows: Mapping[Key, Windows]) -> dict[Key, Windows]:
 
 @dataclass(frozen=True)
 class Contestant:
-    """Windows by one clock.
-
-    Attributes:
-        scorer: of them.
-        dt: physics step, s.
-    """
+    """What scores windows by one clock, and the physics step, s."""
 
     scorer: Scorer
     dt: float

@@ -24,13 +24,8 @@ def max_t(
 
     Under the hypothesis that a model gains nothing, a window's gain is as likely negative. All models' signs are
     flipped together, window by window, and each is compared with the largest statistic of all. Beside the mean over
-    all, each group of joints is looked at by itself: noise of the other legs would hide an effect at one joint.
-
-    Args:
-        gain: of every window and group, the groups of a window side by side.
-        rng: of the flips.
-        groups: G.
-        flips: of signs.
+    all, each of the G groups of joints, which are side by side in a window, is looked at by itself: noise of the other
+    legs would hide an effect at one joint.
     """
     signs = rng.choice([-1.0, 1.0], size=(flips, gain.shape[1]))
     parts = [slice(None), *(slice(g, None, groups) for g in range(groups if groups > 1 else 0))]

@@ -185,15 +185,10 @@ def ladder(p: Param) -> list[float]:
 
 
 def differ(values: np.ndarray, drawn: np.ndarray, tolerance: float) -> bool:
-    """Return whether some of the values differ by more than a tolerance beyond doubt.
+    """Return whether some values (J,) differ by more than a tolerance beyond doubt; ``drawn`` (B, J) are resamples.
 
     If none of them truly does, two estimates differ by at most the tolerance and the difference of their errors. So the
     largest of all pairs, each in its own standard errors, is compared with the largest that errors alone make.
-
-    Args:
-        values: (J,) estimates.
-        drawn: (B, J) the same by resamples.
-        tolerance: by which they may truly differ.
     """
     one, other = np.triu_indices(len(values), 1)
     beyond = np.abs(values[one] - values[other]) - tolerance

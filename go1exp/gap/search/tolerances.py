@@ -199,13 +199,7 @@ def _definite(matrix: np.ndarray) -> np.ndarray:
 
 
 def solve(matrix: np.ndarray, right: np.ndarray, limits: Bounds) -> np.ndarray:
-    """Return the bounded minimum of x' A x - 2 b' x + weight (x - centre)^2.
-
-    Args:
-        matrix: A (n, n), positive semidefinite.
-        right: b (n,).
-        limits: of x.
-    """
+    """Return the minimum of x' A x - 2 b' x + weight (x - centre)^2 within limits; A (n, n) >= 0."""
     scale = 1.0 / np.sqrt(np.diag(matrix) + limits.weight)
     full = _definite((matrix + np.diag(limits.weight)) * scale[:, None] * scale)
     aim = (right + limits.weight * limits.centre) * scale

@@ -241,15 +241,10 @@ def prove(
     contents: Mapping[str, Mapping[str, Any]],
     physics_dt: float,
 ) -> Applied:
-    """Score written files at the step of training, on the windows on which the search scored what they hold.
+    """Score written files at the step of training, s, on the windows on which the search scored what they hold.
 
-    Args:
-        recordings: those of the search.
-        robot: the nominal Go1, or another one.
-        settings: those of the search.
-        result: its outcome.
-        contents: file name -> content, as read back from the files.
-        physics_dt: training's step, s.
+    ``recordings`` and ``settings`` are those of the search, ``result`` is its outcome, and ``contents`` is what was
+    read back from the files, by file name.
 
     Raises:
         GapFileError: if logs or settings are not those of the search: what it held out would not be known.

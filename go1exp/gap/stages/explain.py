@@ -52,16 +52,11 @@ def explain(
     settings: GapSettings | None = None,
     on_progress: Progress = lambda what, share: None,
 ) -> GapResult:
-    """Compare recordings of a robot with its model, and name what is missing.
+    """Compare recordings of a robot, the nominal Go1 or another one, with its model, and name what is missing.
 
     Of a robot that walks, the legs in the air come first: they show effects at joints whatever the ground does. If they
     name something, that is the answer. Otherwise the standing robot is compared too (``settings.phase``).
-
-    Args:
-        recordings: of one robot.
-        robot: the nominal Go1, or another :class:`~go1exp.gap.robots.protocol.Robot`.
-        settings: how; the defaults if None.
-        on_progress: called with what is being done, and which share of the work is finished.
+    ``on_progress`` is called with what is being done, and which share of the work is finished.
 
     Raises:
         ConfigError: if the whole robot is compared, and recordings on the ground name different contacts.

@@ -84,18 +84,10 @@ def loop(
     on_round: Callable[[Turn], None],
     on_progress: Progress = lambda what, share: None,
 ) -> list[Round]:
-    """Close the loop without a user in between.
+    """Close the loop without a user in between: record the hidden robot (``rig``), search, design, and again.
 
-    Args:
-        rig: the hidden robot.
-        episodes: to begin with.
-        sensors: the logger.
-        robot: the model that it is compared with.
-        search: settings of the searches.
-        settings: of the designs.
-        rounds: designed recordings, at most.
-        on_round: called after each search and design.
-        on_progress: as for ``explain``.
+    It begins with ``episodes``, adds ``rounds`` designed recordings at most, and hands each search and design to
+    ``on_round``. The searches compare with the model ``robot``.
 
     Returns:
         A row for each round; the last one says why it ended.

@@ -221,14 +221,8 @@ def design(
 ) -> NextResult:
     """Design the recording that best separates what a result leaves open.
 
-    Args:
-        result: of a search.
-        recordings: in which it searched.
-        robot: that was compared.
-        search: settings of that search.
-        settings: of the design.
-        on_progress: called with what is being done, and which share of the work is finished.
-        names_only: whether to leave out what the recordings did not excite.
+    ``recordings``, ``robot`` and ``search`` are those of the search. With ``names_only`` what the recordings did not
+    excite is left out.
 
     Raises:
         DesignError: if there is nothing that a recording could separate, or none is within the limits.

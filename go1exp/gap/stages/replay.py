@@ -142,15 +142,7 @@ def replay(
     physics_dt: float,
     on_progress: Progress = lambda what, share: None,
 ) -> ReplayResult:
-    """Replay recordings open loop.
-
-    Args:
-        recordings: of one robot.
-        robot: the nominal Go1, or another one.
-        settings: windows, and threads of the engine.
-        physics_dt: longest step of the simulation, s.
-        on_progress: called with what is being done, and which share of the work is finished.
-    """
+    """Replay recordings of one robot open loop, in steps of at most ``physics_dt`` s."""
     robot = robot_from(robot)
     settings = dataclasses.replace(settings, torque=False, physics_dt=physics_dt, phase="whole")
     kinds = [[r for r in recordings if (r.meta.base == "floating") == free] for free in (False, True)]
@@ -248,9 +240,7 @@ def _measured(comparison: Comparison) -> Readings:
 def _measured_trunk(recordings: Sequence[Recording], taken: Callable[[Sequence[np.ndarray]], np.ndarray]) -> Readings:
     """Return the readings of the IMU, and the true velocity of the trunk where the recordings have it.
 
-    Args:
-        recordings: of a standing robot.
-        taken: returns the values (W, n, c) at the windows' sample times of each recording's values (T, c).
+    ``taken`` returns the values (W, n, c) at the windows' sample times of each recording's values (T, c).
     """
     imu = [r.block(*AXES) for r in recordings]
     readings = dict(zip(AXES, np.moveaxis(taken(imu), 2, 0), strict=True))
