@@ -60,7 +60,7 @@ class TorqueDrive(Gains):
 
 @dataclass(frozen=True)
 class FixedBase:
-    """A robot of hinges on a fixed base: its description, its ``top_speed`` (J,), rad/s, and what a ``Machine`` says."""
+    """A robot of hinges on a fixed base: its description, its ``top_speed`` (J,) in rad/s, and all of a ``Machine``."""
 
     config: ModelConfig
     joints: tuple[str, ...]
