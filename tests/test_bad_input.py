@@ -59,40 +59,6 @@ def made(folder: Path, episode: str, rows: int, kp: float = 20.0) -> Path:
     return folder
 
 
-LOGS_NEEDED = "a folder of recordings is needed, such as logs=recordings"
-ANGLE = "must be from 0 to 1 rad; with a unit such as 2mrad or 0.1deg"
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("gap prove", "stage: unknown stage 'prove'; known: all, "),
-        ("gap logs=[]", f"logs = []: {LOGS_NEEDED}"),
-        ("gap logs=", f"logs = '': {LOGS_NEEDED}"),
-        ("gap logs=[a,'']", f"logs = ['a', '']: {LOGS_NEEDED}"),
-        ("gap next logs=", f"logs = '': {LOGS_NEEDED}"),
-        ("gap logs=x out=", "out = '': "),
-        ("gap logs=x accept=-1", f"accept = -1: {ANGLE}"),
-        ("gap logs=x accept=-2mrad", f"accept = '-2mrad': {ANGLE}"),
-        ("gap logs=x accept=2", f"accept = 2: {ANGLE}"),
-        ("gap logs=x accept=..mrad", "accept = '..mrad': must be a number of rad, or one with rad, mrad, deg"),
-        ("gap logs=x +search.effects=[coulmb]", "search.effects: unknown effect 'coulmb'; did you mean 'coulomb'?"),
-        ("gap logs=x search.physics_dt=1e-9", "search.physics_dt = 1e-09: input should be greater than or equal to"),
-        ("gap replay logs=x train_dt=1e-9", "train_dt = 1e-09: input should be greater than or equal to"),
-        ("gap loop +search.effects=[coulmb]", "search.effects: unknown effect 'coulmb'; did you mean 'coulomb'?"),
-        ("gap loop gains=[]", "gains = []: at least one is needed"),
-        ("gap loop seeds=[]", "seeds = []: at least one is needed"),
-        ("gap loop seconds=0.1", "seconds = 0.1: shorter than a window, search.burn_s + search.window_s = 0.37 s"),
-        ("record import go2_in_air x out=", "out = '': "),
-    ],
-)
-def test_a_wrong_setting_about_recordings_is_refused_by_its_key(words: str, said: str, run: Run) -> None:
-    verb = words.split(maxsplit=2)[:2]
-    title = " ".join(verb) if verb[1] in ("next", "loop", "import") else verb[0]
-    status, err = run(*words.split())
-    assert (status, err.startswith(f"go1exp {title}: {said}")) == (2, True), err
-
-
 def test_a_file_in_place_of_recordings_an_answer_or_options_is_called_one(run: Run, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("<xml>no key</xml>")
     status, err = run("gap", "logs=notes.txt")
@@ -191,51 +157,6 @@ def test_two_files_whose_paths_differ_by_a_sign_are_two(tmp_path: Path, monkeypa
     (tmp_path / "a_b.yaml").write_text("coulomb: {bound: 0.2}\n")
     both = [compose("train", choices_from_files([f"effect={name}.yaml"], "train")) for name in ("a-b", "a_b")]
     assert [c["effect"]["coulomb"]["bound"] for c in both] == [0.1, 0.2]
-
-
-@pytest.mark.parametrize(
-    ("words", "status", "said"),
-    [
-        ("train word", 2, "go1exp train: word: not a setting, which is key=value; see go1exp train --help"),
-        (
-            "train -m seed=1,2 ppo.gama=2",
-            2,
-            "go1exp train: ppo.gama=2: no such key 'ppo.gama'; did you mean 'ppo.gamma'",
-        ),
-        ("train -m +seed=1", 2, "+seed=1: 'seed' exists already; leave out the plus: 'seed=1'"),
-        ("train -m --cfg job seed=1,2", 2, "go1exp train: -m and --cfg cannot be used together: --cfg and --info show"),
-        ("eval --foo", 2, "go1exp eval: --foo: unknown option; see go1exp eval --help"),
-        ("list reward rand", 2, "go1exp list: rand: not a setting, which is key=value; see go1exp list --help"),
-        ("train --config-dir nowhere reward=x", 2, "no such folder"),
-        (
-            "train schedule=papr",
-            2,
-            "go1exp train: schedule=papr: unknown choice of schedule 'papr'; did you mean 'paper'?",
-        ),
-        ("eval reward=paper", 2, "go1exp eval: reward=paper: no such key 'reward'; see --help"),
-        ("eval policy=papr", 2, "go1exp eval: policy: unknown shipped policy 'papr'; did you mean 'paper'?"),
-        ("eval run=.", 2, "go1exp eval: run = '.': not a run folder (it has no config.yaml)"),
-        ("play policy=paper out=x.xyz", 2, "go1exp play: out = 'x.xyz': a clip is .mp4 or .gif"),
-        ("play policy=paper out=.", 2, "go1exp play: out = '.': is a folder; name the file, such as out=play.mp4"),
-        ("gap report", 2, "go1exp gap: gap/verdict.json: no such file; run go1exp gap explain first"),
-        ("gap logs=.", 2, "go1exp gap: .: no *.parquet in it"),
-        ("export check .", 2, "go1exp export check: Is a directory: ."),
-        ("deploy nowhere.zip", 2, "go1exp deploy: No such file or directory: nowhere.zip"),
-        ("deploy x.zip feet=f.json", 2, "feet = f.json: calibrates sensors that report counts; those of robot=sim"),
-        ("deploy walk.zip robot=sm", 2, "go1exp deploy: robot = 'sm': input should be 'sim' or 'go1'"),
-        (
-            "train reward=qqq",
-            2,
-            "go1exp train: reward=qqq: unknown choice of reward 'qqq'; known: clock, paper, paper_literal, spot",
-        ),
-    ],
-)
-def test_bad_input_is_answered_in_one_line(words: str, status: int, said: str, run: Run, tmp_path: Path) -> None:
-    code, text = run(*words.split())
-    assert code == status, text
-    assert said in text
-    assert text.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_users_own_choices_are_among_those_that_are_known(run: Run, tmp_path: Path) -> None:

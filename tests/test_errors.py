@@ -152,31 +152,6 @@ def test_choices_of_ones_own_that_are_no_yaml_or_lead_back_are_refused_by_file(t
         assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("train =", "=: not a setting, which is key=value"),
-        ("train seed=${oc.env:NO_SUCH_VARIABLE}", "seed: Environment variable 'NO_SUCH_VARIABLE' not found"),
-        ("train device=mars", "device = 'mars': must be auto, cpu, cuda, or one of several as cuda:1"),
-        ("train ppo.hidden=[100000000]", "ppo.hidden = [100000000]: with ppo."),
-        ("eval policy=paper effect.coulomb.bound=0.2", "no file of effect is chosen, as effect=coulomb does"),
-        ("record excitation=[nope]", "excitation.nope: unknown excitation term 'nope'; known: chirp"),
-        ("compare paper @100hz", "subjects: '@100hz': names no policy before @"),
-        ("sim address=nonsense", "address=nonsense: must be HOST:PORT"),
-        ("sim address=8.8.8.8:8007", "address = 8.8.8.8:8007: "),
-        ("deploy nowhere.zip", "No such file or directory: nowhere.zip"),
-        ("gap logs=nowhere", "nowhere: no such file"),
-        ("train --help nope", "no group or key 'nope'"),
-        ("-sc install=cmd", "-sc install=cmd: install, uninstall or query"),
-    ],
-)
-def test_what_is_refused_is_named(words: str, said: str, tmp_path: Path) -> None:
-    done = refuse(tmp_path, *words.split())
-    assert done.returncode == 2, done.stderr
-    assert said in done.stderr
-    assert done.stderr.count("\n") == 1, done.stderr
-
-
 @pytest.mark.parametrize("override", ["reward=papr", "rand=tabel1", "terrain=ruff", "event=psh"])
 def test_make_raises_errors_of_go1exp(override: str) -> None:
     with pytest.raises(ConfigError, match=f"{override}: unknown choice"):

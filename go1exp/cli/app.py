@@ -61,7 +61,7 @@ class App:
 
         def task(config: Any) -> None:
             try:
-                status.append(self.task(begin(self.name, plain(config))))
+                status.append(self.task(begin(self.name, self._plain(config))))
             except Exception as error:
                 if hydra_main.in_multirun():
                     job = hydra_main.job()
@@ -82,12 +82,24 @@ class App:
             if failure:
                 raise failure[0]
         except Exception as error:
-            raise self._as_refusal(error, arguments) from error.__cause__
+            refusal = self._as_refusal(error, arguments)
+            if refusal is error:
+                raise
+            raise refusal from error
         finally:
             while _bars:  # one that an error leaves behind hides the terminal's cursor
                 _bars.pop().stop()
             warnings.formatwarning = formatwarning
         return next((s for s in status if s), 0) or 0
+
+    def _plain(self, config: Any) -> dict[str, Any]:
+        """Return the configuration with interpolations resolved; where one cannot be, no run folder stays."""
+        try:
+            return plain(config)
+        except Exception:
+            if self.name == "train":
+                discard(hydra_main.output_folder())
+            raise
 
     def failed_in_sweep(self, error: Exception, number: int, overrides: Sequence[str]) -> int:
         """Print what went wrong with a job of a sweep and return its status: the other jobs do not depend on it."""

@@ -82,12 +82,17 @@ class Job:
     launcher: dict[str, Any]
 
 
+def output_folder() -> Path:
+    """Return the folder of the job that is running."""
+    return Path(HydraConfig.get().runtime.output_dir)
+
+
 def job() -> Job:
     """Return the job that is running."""
     about = HydraConfig.get()
     multirun = about.mode == RunMode.MULTIRUN
     return Job(
-        Path(about.runtime.output_dir),
+        output_folder(),
         multirun,
         about.job.num if multirun else 0,
         list(about.overrides.task),
