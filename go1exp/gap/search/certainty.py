@@ -144,21 +144,21 @@ def exact_aliases(search: Search, effect: str, joints: Sequence[str]) -> tuple[s
     chi2 = state.scorer.chi2(linear.residual, linear.windows)
     matrix, _ = layout.total(linear.grams(state.scorer) / np.maximum(chi2, 1.0)[..., None, None])
     everyone = state.scorer.windows.joints
-    of = np.array([linear.probes[k].key[0] for k in layout.probe])
+    effects = np.array([linear.probes[k].key[0] for k in layout.probe])
     at = np.isin(layout.joint, [-1, *(everyone.index(j) for j in joints)])
     guessed = (
         set(GAINS) - {effect} if effect in GAINS and getattr(state.machine, "guessed_gains", False) else set[str]()
     )
-    rivals = [{name} for name in dict.fromkeys(of) if name != effect] + ([guessed] if guessed else [])
-    own = np.flatnonzero((of == effect) & at)
+    rivals = [{name} for name in dict.fromkeys(effects) if name != effect] + ([guessed] if guessed else [])
+    columns = np.flatnonzero((effects == effect) & at)
 
     def acts_alike(names: set[str]) -> bool:
         return all(
-            spanned(matrix, int(i), np.flatnonzero(np.isin(of, list(names)) & (layout.joint == layout.joint[i])))
-            for i in own
+            spanned(matrix, int(i), np.flatnonzero(np.isin(effects, list(names)) & (layout.joint == layout.joint[i])))
+            for i in columns
         )
 
-    return tuple(sorted(set().union(*filter(acts_alike, rivals)))) if len(own) else ()
+    return tuple(sorted(set().union(*filter(acts_alike, rivals)))) if len(columns) else ()
 
 
 def spanned(matrix: np.ndarray, column: int, others: np.ndarray) -> bool:
