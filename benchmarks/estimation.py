@@ -26,11 +26,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from benchmarks.mocap import Evaluation, evaluate
+from benchmarks.replay import samples
 from go1exp.base.paths import data_root
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import bind
 from go1exp.deploy.estimation import Status, go1, make_filter, readings, scaler
-from go1exp.deploy.estimation.replay import samples
 from go1exp.logs.importers.source import files
 from go1exp.logs.record.sensors import Channel, SensorConfig
 from go1exp.logs.record.simulate import Rig, Walk, play, play_policy

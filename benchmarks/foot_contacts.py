@@ -21,12 +21,12 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from benchmarks.estimation import COMMANDS, SENSORS
+from benchmarks.replay import samples
 from go1exp.base.paths import data_root
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import bind
 from go1exp.deploy.estimation import go1, make_filter, readings
 from go1exp.deploy.estimation.feet import FootCalibration, LoadByBoth, forces_by_torque, kinematics
-from go1exp.deploy.estimation.replay import samples
 from go1exp.deploy.runtime.estimate import BOTH, TORQUE
 from go1exp.logs.record.simulate import Rig, Walk, play_policy
 from go1exp.logs.recording import VECTORS, Recording

@@ -10,10 +10,10 @@ from scipy.interpolate import interp1d
 from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation
 
+from benchmarks.replay import SCALER_LOG, Log, estimate, samples
 from go1exp.deploy.estimation import FilterConfig
 from go1exp.deploy.estimation import readings as column
 from go1exp.deploy.estimation.feet import kinematics
-from go1exp.deploy.estimation.replay import SCALER_LOG, Log, estimate, samples
 from go1exp.logs.importers import import_recordings
 from go1exp.logs.importers.scaler_walk_mocap import Mocap, motion_capture
 from go1exp.logs.importers.source import load_npz

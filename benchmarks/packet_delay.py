@@ -20,11 +20,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from benchmarks.foot_contacts import walks
+from benchmarks.replay import samples
 from go1exp.base.paths import data_root
 from go1exp.deploy.estimation import go1, make_filter, readings, sample
-from go1exp.deploy.estimation.replay import samples
 from go1exp.deploy.runtime.estimate import KalmanEstimator
-from go1exp.deploy.runtime.packet_delay import PacketDelay
+from go1exp.deploy.runtime.udp import PacketDelay
 from go1exp.logs.recording import VECTORS
 from go1exp.robot.go1_fields import PERIOD
 from go1exp.robot.messages import OVERTAKEN_S, LowState

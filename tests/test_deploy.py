@@ -50,7 +50,7 @@ from go1exp.deploy.runtime.safety import RULES
 from go1exp.deploy.runtime.walk import FAULTS, STATUS, Plan
 from go1exp.deploy.sim_robot.__main__ import bundle_task, sim_config
 from go1exp.deploy.sim_robot.machine import NOISE, SILENCE, TICK, Robot, turned
-from go1exp.deploy.sim_robot.server import TRUTH, Network, Truth
+from go1exp.deploy.sim_robot.server import TRUTH, Network, Newest
 from go1exp.evaluate.controller.mpc import Mpc
 from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
 from go1exp.evaluate.controller.types import Deployed
@@ -176,7 +176,7 @@ def test_jitter_delays_each_datagram_by_its_own_and_lets_one_overtake_another() 
 
 
 def test_of_the_truth_the_newest_is_kept_and_memory_does_not_grow() -> None:
-    truth = Truth(2, kept=25.0)
+    truth = Newest(2, kept=25.0)
     for k in range(40_000):
         truth.add(TICK * k, np.array([k, -k]))
     rows = truth.rows()

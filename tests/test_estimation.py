@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.replay import estimate
 from go1exp import robot
 from go1exp.base.paths import data_root
 from go1exp.config.compose import compose
@@ -37,7 +38,6 @@ from go1exp.deploy.estimation import (
     scaler,
     to_json,
 )
-from go1exp.deploy.estimation.replay import estimate
 from go1exp.logs.record.plan import Episode, make_motion
 from go1exp.logs.record.sensors import Channel, SensorConfig
 from go1exp.logs.record.simulate import Rig, play

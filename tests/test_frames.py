@@ -14,7 +14,7 @@ from gymnasium.spaces import Box
 from go1exp.config.schema.history import columns_of, history_columns
 from go1exp.deploy.export.build import metadata, readings
 from go1exp.deploy.export.graph import DeployedPolicy
-from go1exp.deploy.runtime.metadata import Block, Metadata, Port
+from go1exp.deploy.runtime.metadata import Block, Metadata, Port, Trained
 from go1exp.deploy.runtime.policy import PolicyMemory
 from go1exp.evaluate.agents import PolicyAgent
 from go1exp.mdp.types import TermSetup
@@ -173,7 +173,7 @@ def test_on_the_robot_a_policy_sees_the_frames_that_the_environment_showed_it(ma
     observation = core.reset()
     policy = GaussianPolicy(Box(-9.0, 9.0, (core.observation_size,)), Box(-1.0, 1.0, (12,)), lambda _: 0.0)
     module = DeployedPolicy(policy, task.observation, task.action)
-    about = metadata(task, module, {"file": __file__, "iteration": 0, "num_timesteps": 0})
+    about = metadata(task, module.inputs, Trained("made.pt", "", 0, 0))
     memory = PolicyMemory(about, task.sim.policy_dt)
 
     def run(given: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

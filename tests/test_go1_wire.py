@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 
 from go1exp.deploy.runtime import go1_wire as wire
 from go1exp.deploy.runtime.udp import Go1Link
+from go1exp.deploy.sim_robot import SimConfig
 from go1exp.deploy.sim_robot.machine import Robot
 from go1exp.deploy.sim_robot.server import Packets, Server, roll_pitch_yaw
-from go1exp.deploy.sim_robot.settings import SimConfig
 from go1exp.robot import go1_fields as fields
 from go1exp.robot.messages import LowCmd, LowState
 

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from go1exp import robot
 from go1exp.deploy.estimation import Status, go1, make_filter, sample
 from go1exp.deploy.runtime.estimate import LONGEST_AHEAD, KalmanEstimator, acceleration
-from go1exp.deploy.runtime.packet_delay import MOST_SLIP, WINDOW_S, PacketDelay, delays, slip, spread
 from go1exp.deploy.runtime.report import summary_lines
+from go1exp.deploy.runtime.udp import MOST_SLIP, WINDOW_S, PacketDelay, delays, slip, spread
 from go1exp.robot.go1_fields import PERIOD
 from go1exp.robot.messages import OVERTAKEN_S, LowState
 from tests.made import low_state

@@ -17,9 +17,9 @@ from go1exp import robot
 from go1exp.base.errors import Expected
 from go1exp.config.compose import compose
 from go1exp.deploy.runtime import go1_wire
+from go1exp.deploy.sim_robot import SimConfig
 from go1exp.deploy.sim_robot.machine import TICK, Body, Robot
 from go1exp.deploy.sim_robot.server import STRANGER, Server
-from go1exp.deploy.sim_robot.settings import SimConfig
 from go1exp.evaluate.viewer import requests as ask
 from go1exp.evaluate.viewer import sim_process
 from go1exp.evaluate.viewer.session import SPAN

@@ -17,7 +17,7 @@ from go1exp.config.schema import settings as schema
 from go1exp.config.schema.registry import ConfigError, NonNegative, Positive
 from go1exp.config.schema.settings import subset
 from go1exp.deploy.runtime.controller import Stages
-from go1exp.deploy.sim_robot.settings import SimConfig
+from go1exp.deploy.sim_robot import SimConfig
 from go1exp.evaluate.controller.settings import MpcSettings
 
 if TYPE_CHECKING:

@@ -20,10 +20,11 @@ from go1exp.config.choices import choice_files, config_folder, load
 from go1exp.config.schema import settings as schema
 from go1exp.config.schema.registry import ConfigError, Duration, FolderName, Speed
 from go1exp.config.schema.settings import subset
-from go1exp.deploy.sim_robot.settings import SimConfig, SimSettings
+from go1exp.deploy.sim_robot import SimConfig, SimSettings
 
 if TYPE_CHECKING:
     from go1exp.config.schema.physics import BackendConfig
+    from go1exp.deploy.sim_robot import SimConfig
     from go1exp.deploy.sim_robot.machine import Body
     from go1exp.evaluate.agents import Agent
     from go1exp.evaluate.viewer.requests import Ground

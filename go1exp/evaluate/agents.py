@@ -21,7 +21,7 @@ from go1exp.deploy.runtime.policy import Past, PolicyMemory
 from go1exp.deploy.sim_robot.machine import noisy
 from go1exp.evaluate.controller.batch import Driven
 from go1exp.evaluate.controller.types import Controller, TrunkVelocity
-from go1exp.logs.record.tape import sample
+from go1exp.logs.record.simulate import sample
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TaskConfig
 from go1exp.train.policy import Policy

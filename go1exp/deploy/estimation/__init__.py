@@ -103,14 +103,7 @@ def _plain(module: ModuleType, name: str, value: object) -> object:
     return SOURCES.index(str(value)) if name == "contact_source" else value
 
 
-COLUMNS = {
-    "quat": readings.QUAT,
-    "gyro": readings.GYRO,
-    "acc": readings.ACC,
-    "q": readings.Q,
-    "qd": readings.QD,
-    "foot_force": readings.FOOT_FORCE,
-}
+COLUMNS = {name: getattr(readings, name.upper()) for name in ("quat", "gyro", "acc", "q", "qd", "foot_force")}
 """Names of readings and their columns in a sample."""
 
 

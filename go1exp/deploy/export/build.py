@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
 import importlib.metadata
 import json
 import platform
@@ -23,7 +22,7 @@ from go1exp.config.schema.joint_values import spread
 from go1exp.config.schema.physics import CpuBackend
 from go1exp.config.schema.registry import Term
 from go1exp.deploy.estimation import go1, to_json
-from go1exp.deploy.export.graph import DeployedPolicy, ExportError, blocks, to_onnx
+from go1exp.deploy.export.graph import DeployedPolicy, ExportError, blocks, outputs, to_onnx
 from go1exp.deploy.runtime import bundle
 from go1exp.deploy.runtime.metadata import Metadata, Port, Trained
 from go1exp.robot.config import RobotConfig
@@ -160,24 +159,25 @@ def build(
         trace = record(config.task, policy, module.inputs, seconds, seed, on_step)
     if not trace:
         raise ExportError(f"{run}: every step of the trace ended an episode; there is nothing to replay")
-    data = bundle.write(
-        metadata(config.task, module, about), run_folder.read_as_written(run), _versions(run), model, trace
-    )
+    file = Path(about["file"])
+    trained = Trained(file.name, bundle.seal(file.read_bytes()), int(about["iteration"]), int(about["num_timesteps"]))
+    described = metadata(config.task, module.inputs, trained)
+    data = bundle.write(described, run_folder.read_as_written(run), versions(run), model, trace)
     bundle.loads(data, str(run))  # read back: what is handed out has been replayed once
     return data
 
 
-def metadata(task: TaskConfig, module: DeployedPolicy, about: dict[str, Any]) -> Metadata:
-    """Return the metadata of a task's policy; ``about`` describes its checkpoint, as ``load_network`` returns it."""
-    file = Path(about["file"])
+def metadata(task: TaskConfig, inputs: tuple[Port, ...], trained: Trained) -> Metadata:
+    """Return the metadata of a task's policy, whose graph has these inputs; ``trained`` is its origin."""
     config: RobotConfig = task.robot
+    observation = blocks(task.observation)
     return Metadata(
         robot="go1",
         joints=robot.JOINTS,
         legs=robot.LEGS,
-        inputs=module.inputs,
-        outputs=module.outputs,
-        observation=blocks(task.observation),
+        inputs=inputs,
+        outputs=outputs(sum(block.size for block in observation)),
+        observation=observation,
         nominal_stance=tuple(robot.NOMINAL_STANCE.tolist()),
         action_scale=task.action.scale,
         action_clip=task.action.clip,
@@ -191,12 +191,7 @@ def metadata(task: TaskConfig, module: DeployedPolicy, about: dict[str, Any]) ->
         command_ranges=command_ranges(task.command),
         conventions=CONVENTIONS,
         estimator=json.loads(to_json(go1())),
-        trained=Trained(
-            checkpoint=file.name,
-            sha256=hashlib.sha256(file.read_bytes()).hexdigest(),
-            iteration=int(about["iteration"]),
-            num_timesteps=int(about["num_timesteps"]),
-        ),
+        trained=trained,
     )
 
 
@@ -221,7 +216,7 @@ def command_ranges(command: Term) -> dict[str, tuple[float, float]]:
     return {name: (float(pair[0]), float(pair[1])) for name, pair in pairs.items()}
 
 
-def _versions(run: Path) -> dict[str, Any]:
+def versions(run: Path) -> dict[str, Any]:
     """Return the versions of the exporting packages, and those that the run recorded when it was trained."""
     packages = {}
     for name in PACKAGES:

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from go1exp import robot
 from go1exp.base.tensors.threads import one_thread
-from go1exp.config.schema.history import HistoryColumns, history_columns
+from go1exp.config.schema.history import history_columns
 from go1exp.config.schema.registry import ConfigError
-from go1exp.deploy.export.build import _versions, metadata, readings
+from go1exp.deploy.export.build import metadata, readings, versions
 from go1exp.deploy.export.foreign import (
     ALIASES,
     ORDERS,
@@ -22,19 +23,23 @@ from go1exp.deploy.export.foreign import (
     STANCE,
     Back,
     Front,
+    Observed,
     Spec,
     config_of,
     spec_of,
 )
 from go1exp.deploy.export.foreign_graph import Network, compose_graph
-from go1exp.deploy.export.graph import OUTPUTS, ExportError
+from go1exp.deploy.export.graph import ExportError
 from go1exp.deploy.runtime import bundle
 from go1exp.deploy.runtime.metadata import Trained
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TrainConfig
 
 COMMANDS = ((0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.3, 0.0), (0.0, 0.0, 0.5))
-"""Commands of the simulation, m/s, m/s, rad/s."""
+"""Commands of the simulation, m/s, m/s, rad/s: a robot stands, another one walks forward, ..."""
+
+STANDS, WALKS = 0, 1
+"""Robots of a contract whose first targets and whose trace are kept."""
 
 SECONDS, SETTLE = 2.0, 0.7
 """Length of the simulation, and its beginning, in which errors do not count, s."""
@@ -50,19 +55,47 @@ class Outcome:
     fall: float
     follows: float
 
+    @property
+    def falls(self) -> bool:
+        """Whether a robot falls."""
+        return bool(np.isfinite(self.fall))
 
-def _look(
-    front: Front, sensed: dict[str, torch.Tensor], past: torch.Tensor | None, history: HistoryColumns
-) -> tuple[list[torch.Tensor], torch.Tensor, torch.Tensor]:
-    """Return the inputs of a front, its observation, and what the network reads; ``past`` is None in the first step."""
-    if past is None or history.earlier:
-        empty = torch.zeros(len(next(iter(sensed.values()))), len(history.earlier))
-        sensed["past"] = empty if past is None else past
-    given = [sensed[port.name] for port in front.inputs]
-    if past is None and history.earlier:  # a history begins with its first frame repeated
-        sensed["past"] = front(*given)[0][:, history.newest]
-        given = [sensed[port.name] for port in front.inputs]
-    return (given, *front(*given))
+
+class _Robots:
+    """The robots of one contract: ``rows`` of an environment, which observe and act by it."""
+
+    def __init__(self, spec: Spec, config: TrainConfig, rows: slice) -> None:
+        self.rows, self._front, self._back = rows, Front(spec, config), Back(spec, config)
+        self._history, self._past = history_columns(config.task.observation), None
+
+    def observe(self, now: Mapping[str, Tensor]) -> Tensor:
+        """Return what the network reads for the readings of the environment."""
+        sensed = {name: values[self.rows] for name, values in now.items()}
+        if self._past is not None:
+            sensed["past"] = self._past
+        else:
+            sensed["past"] = torch.zeros(len(sensed["joint_pos"]), len(self._history.earlier))
+            if self._history.earlier:  # a history begins with its first frame repeated
+                sensed["past"] = self._front(*self._inputs(sensed))[0][:, self._history.newest]
+        self._given = self._inputs(sensed)
+        self._observation, wanted = self._front(*self._given)
+        self._past = self._observation[:, self._history.carried]
+        return wanted
+
+    def _inputs(self, sensed: Mapping[str, Tensor]) -> list[Tensor]:
+        return [sensed[port.name] for port in self._front.inputs]
+
+    def act(self, raw: Tensor) -> Tensor:
+        """Return the actions for the network's output of all robots."""
+        self.target, self._action = self._back(raw[self.rows])
+        return self._action
+
+    def row(self, t: float) -> dict[str, np.ndarray]:
+        """Return the row of a trace at time ``t``, s: the last step of the robot that walks forward."""
+        values = {f"input.{port.name}": v for port, v in zip(self._front.inputs, self._given, strict=True)}
+        made = {"joint_target": self.target, "observation": self._observation, "action": self._action}
+        values |= {f"output.{name}": v for name, v in made.items()}
+        return {"time": np.array([t]), **{k: v[WALKS : WALKS + 1].numpy().copy() for k, v in values.items()}}
 
 
 def _outcomes(errors: np.ndarray, fall: np.ndarray) -> list[Outcome]:
@@ -87,81 +120,62 @@ def drive(
     core.reset()
     commands = torch.tensor(COMMANDS).repeat(len(specs), 1)
     # all act in the units of the first
-    fronts, backs = [Front(s, config) for s in specs], [Back(s, config) for s in specs]
-    history, past = history_columns(config.task.observation), None
-    fall, steps = np.full(len(commands), np.inf), round(seconds / period)
+    groups = [_Robots(spec, config, slice(k * each, (k + 1) * each)) for k, spec in enumerate(specs)]
+    fall = np.full(len(commands), np.inf)
     errors: list[np.ndarray] = []
     rows: list[dict[str, np.ndarray]] = []
-    for step in range(steps):
+    for step in range(round(seconds / period)):
         core.command.value.copy_(commands)
-        now, parts, observations = readings(core), [], []
-        for k, front in enumerate(fronts):
-            sensed = {name: values[k * each : (k + 1) * each] for name, values in now.items()}
-            given, observation, wanted = _look(front, sensed, None if past is None else past[k], history)
-            observations.append(observation)
-            parts.append(wanted)
-            if k == 0 and np.isinf(fall[1]):
-                inputs = {f"input.{p.name}": v[1:2] for p, v in zip(front.inputs, given, strict=True)}
-        raw = torch.from_numpy(network(torch.cat(parts).numpy()))
-        out = [back(raw[k * each : (k + 1) * each]) for k, back in enumerate(backs)]
+        now = readings(core)
+        raw = torch.from_numpy(network(torch.cat([group.observe(now) for group in groups]).numpy()))
+        actions = torch.cat([group.act(raw) for group in groups])
         if step == 0:
-            rest = out[0][0][0].numpy().astype(float)
-        if np.isinf(fall[1]):
-            made = dict(
-                zip(("joint_target", "observation", "action"), (out[0][0], observations[0], out[0][1]), strict=True)
-            )
-            row = {**inputs, **{f"output.{name}": values[1:2] for name, values in made.items()}}
-            rows.append({"time": np.array([step * period]), **{k: v.numpy().copy() for k, v in row.items()}})
-        past = [o[:, history.carried] for o in observations]
-        result = core.step(torch.cat([action for _, action in out]))
+            rest = groups[0].target[STANDS].numpy().astype(float)
+        if np.isinf(fall[WALKS]):
+            rows.append(groups[0].row(step * period))
+        result = core.step(actions)
         fall = np.where(result.terminated.numpy() & np.isinf(fall), (step + 1) * period, fall)
         s = core.snapshot()
-        velocity = torch.cat([s.base_lin_vel_b[:, :2], s.base_ang_vel_b[:, 2:]], dim=1)
         if step * period >= SETTLE:
-            errors.append((velocity - commands).numpy())
+            errors.append((torch.cat([s.base_lin_vel_b[:, :2], s.base_ang_vel_b[:, 2:]], dim=1) - commands).numpy())
     outcomes = _outcomes(np.mean(errors, axis=0).reshape(len(specs), each, 3), fall.reshape(len(specs), each))
     return outcomes, {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}, rest
 
 
 def alternatives(spec: Spec) -> Iterator[tuple[str, Spec]]:
     """Yield contracts that differ from the stated one in one respect, with its name."""
-    change = dataclasses.replace
+    change, scale = dataclasses.replace, spec.joints("action_scale")
+    per_joint = ("kp", "kd", "default_pose", "action_scale")
+    by_name = {key: dict(zip(spec.names, spec.joints(key), strict=True)) for key in per_joint}
     for name, order in ORDERS.items():
         if order != spec.names:
-            in_order = {key: dict(zip(spec.names, spec.joints(key), strict=True)) for key in ("kp", "kd")}
-            poses = {
-                key: dict(zip(spec.names, spec.joints(key), strict=True)) for key in ("default_pose", "action_scale")
-            }
-            yield f"joint order: joint_order={name}", change(spec, joint_order=name, **in_order, **poses)
-    negative = -spec.joints("joint_sign")
-    yield "sign: joint_sign reversed", change(spec, joint_sign=tuple(negative))
-    yield "sign: action_scale reversed", change(spec, action_scale=tuple(-spec.joints("action_scale")))
+            yield f"joint order: joint_order={name}", change(spec, joint_order=name, **by_name)
+    yield "sign: joint_sign reversed", change(spec, joint_sign=tuple(-spec.joints("joint_sign")))
+    yield "sign: action_scale reversed", change(spec, action_scale=tuple(-scale))
     for factor in (0.5, 2.0):
-        yield (
-            f"scale: action_scale x {factor:g}",
-            change(spec, action_scale=tuple(factor * spec.joints("action_scale"))),
-        )
-    stances = {"the nominal stance": dict(zip(robot.JOINTS, STANCE, strict=True))}
-    stances["that of preset mjlab"] = PRESETS["mjlab"]["default_pose"]
-    for name, pose in stances.items():
-        yield f"default pose: {name}", change(spec, default_pose=pose)
-    usual = {ALIASES.get(e["term"], e["term"]): e for e in PRESETS["legged_gym"]["observation"]}
+        yield f"scale: action_scale x {factor:g}", change(spec, action_scale=tuple(factor * scale))
+    nominal = dict(zip(robot.JOINTS, STANCE, strict=True))
+    yield "default pose: the nominal stance", change(spec, default_pose=nominal)
+    yield "default pose: that of preset mjlab", change(spec, default_pose=PRESETS["mjlab"]["default_pose"])
     for k, observed in enumerate(spec.observation):
-        name = ALIASES.get(observed.term, observed.term)
-        others: list[tuple[str, dict[str, Any]]] = []
-        if name == "projected_gravity":
-            others = [("gravity frame: sign", {"scale": tuple(-np.broadcast_to(observed.scale, 3))})]
-            others += [("gravity frame: quaternion=inverse", {"quaternion": "inverse"})]
-            others += [("quaternion order: quaternion=xyzw", {"quaternion": "xyzw"})]
-        if name == "joint_position":
-            others = [(f"joint_position: relative={not observed.relative}", {"relative": not observed.relative})]
-        for scale in (
-            {1.0, usual.get(name, {}).get("scale", 1.0)} if name != "velocity_command" else {1.0, (2.0, 2.0, 0.25)}
-        ):
-            others += [(f"scale: {name} x {scale}", {"scale": scale})] if scale != observed.scale else []
-        for text, values in others:
+        for text, values in _other_readings(observed):
             terms = [*spec.observation[:k], change(observed, **values), *spec.observation[k + 1 :]]
             yield text, change(spec, observation=tuple(terms))
+
+
+def _other_readings(observed: Observed) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield what a term may be in place of what is stated: name, and attributes of ``Observed``."""
+    name = ALIASES.get(observed.term, observed.term)
+    if name == "projected_gravity":
+        yield "gravity frame: sign", {"scale": tuple(-np.broadcast_to(observed.scale, 3))}
+        yield "gravity frame: quaternion=inverse", {"quaternion": "inverse"}
+        yield "quaternion order: quaternion=xyzw", {"quaternion": "xyzw"}
+    if name == "joint_position":
+        yield f"joint_position: relative={not observed.relative}", {"relative": not observed.relative}
+    usual = {ALIASES.get(e["term"], e["term"]): e.get("scale", 1.0) for e in PRESETS["legged_gym"]["observation"]}
+    theirs = usual.get(name, 1.0)
+    for scale in {1.0, tuple(theirs) if isinstance(theirs, list) else theirs} - {observed.scale}:
+        yield f"scale: {name} x {scale}", {"scale": scale}
 
 
 def build_foreign(file: Path, given: str, *, force: bool = False) -> tuple[bytes, list[str]]:
@@ -191,32 +205,29 @@ def build_foreign(file: Path, given: str, *, force: bool = False) -> tuple[bytes
         raise ConfigError([f"observation: {front.size} numbers ({terms}); the network takes {network.size}"])
     with one_thread(), torch.no_grad():
         (stated,), trace, rest = drive(config, [spec], network)
-        lines += at_rest(spec, rest)
-        likely = []
-        if np.isfinite(stated.fall) or stated.follows < 1 - BETTER:
-            others = list(alternatives(spec))
-            outcomes, _, _ = drive(config, [other for _, other in others], network)
-            stands = [(r.follows, n) for r, (n, _) in zip(outcomes, others, strict=True) if np.isinf(r.fall)]
-            least = -np.inf if np.isfinite(stated.fall) else stated.follows + BETTER
-            likely = [f"{n} (follows {v:.0%})" for v, n in sorted(stands, reverse=True) if v > least][:3]
+        likely = _likelier(stated, config, spec, network)
         model = compose_graph(front, back, network)
-    what = f"falls after {stated.fall:.2f} s" if np.isfinite(stated.fall) else f"stands {SECONDS:g} s"
+    what = f"falls after {stated.fall:.2f} s" if stated.falls else f"stands {SECONDS:g} s"
     verdict = f"with the stated contract it {what} and follows the commands to {stated.follows:.0%}"
     if likely:
         verdict += f"; likely mismatch, since it stands with: {'; '.join(likely)}"
-    if (likely or np.isfinite(stated.fall)) and not force:
+    if (likely or stated.falls) and not force:
         raise ExportError(f"{file}: {verdict}; force=true imports it all the same")
-    lines.append(verdict)
-    trained = Trained(file.name, network.sha256, 0, 0)
-    size_of = {p.name: p.size or front.size for p in OUTPUTS}
-    ports = type("Ports", (), {"inputs": front.inputs, "outputs": tuple(
-        dataclasses.replace(p, size=size_of[p.name]) for p in OUTPUTS
-    )})  # fmt: skip
-    about: dict[str, Any] = {"file": str(file), "iteration": 0, "num_timesteps": 0}
-    meta = dataclasses.replace(metadata(config.task, ports, about), trained=trained)  # type: ignore[arg-type]
-    data = bundle.write(meta, container, _versions(file.parent), model, trace)
+    described = metadata(config.task, front.inputs, Trained(file.name, network.sha256, 0, 0))
+    data = bundle.write(described, container, versions(file.parent), model, trace)
     bundle.loads(data, str(file))
-    return data, lines
+    return data, [*lines, *at_rest(spec, rest), verdict]
+
+
+def _likelier(stated: Outcome, config: TrainConfig, spec: Spec, network: Network) -> list[str]:
+    """Return up to three contracts under which a policy that falls, or follows badly, stands and follows better."""
+    if not stated.falls and stated.follows >= 1 - BETTER:
+        return []
+    others = list(alternatives(spec))
+    outcomes, _, _ = drive(config, [other for _, other in others], network)
+    stands = [(r.follows, name) for r, (name, _) in zip(outcomes, others, strict=True) if not r.falls]
+    least = -np.inf if stated.falls else stated.follows + BETTER
+    return [f"{name} (follows {share:.0%})" for share, name in sorted(stands, reverse=True) if share > least][:3]
 
 
 def at_rest(spec: Spec, target: np.ndarray) -> list[str]:
@@ -227,18 +238,18 @@ def at_rest(spec: Spec, target: np.ndarray) -> list[str]:
         target: joint targets, rad, (12,) in the order of ``JOINTS``.
     """
     order = [spec.names.index(name) for name in robot.JOINTS]
-    off = target - (spec.joints("joint_sign") * spec.joints("default_pose"))[order]
-    torque, limit = spec.joints("kp")[order] * off, np.tile(robot.EFFORT_LIMIT, robot.NUM_LEGS)
-    k, share, (low, high) = int(np.argmax(np.abs(off))), np.abs(torque) / limit, robot.JOINT_POS_LIMITS.T
-    most = int(np.argmax(share))
+    sign, pose, kp = (spec.joints(key)[order] for key in ("joint_sign", "default_pose", "kp"))
+    away = target - sign * pose  # rad
+    torque = kp * away  # N m
+    share = np.abs(torque) / np.tile(robot.EFFORT_LIMIT, robot.NUM_LEGS)
+    far, hard = int(np.argmax(np.abs(away))), int(np.argmax(share))
     lines = [
-        f"first target: {robot.JOINTS[k]} {off[k]:+.2f} rad from its default pose; "
-        f"largest torque: {robot.JOINTS[most]} {torque[most]:+.1f} N m, {share[most]:.0%} of its limit"
+        f"first target: {robot.JOINTS[far]} {away[far]:+.2f} rad from its default pose; "
+        f"largest torque: {robot.JOINTS[hard]} {torque[hard]:+.1f} N m, {share[hard]:.0%} of its limit"
     ]
-    for what, wrong in (
-        ("with torques beyond the limit", share > 1),
-        ("beyond the stops", (target < low) | (target > high)),
-    ):
-        if np.any(wrong):
+    low, high = robot.JOINT_POS_LIMITS.T
+    beyond = {"with torques beyond the limit": share > 1, "beyond the stops": (target < low) | (target > high)}
+    for what, wrong in beyond.items():
+        if wrong.any():
             lines.append(f"warning: first targets {what}: {', '.join(np.array(robot.JOINTS)[wrong])}")
     return lines

@@ -13,7 +13,7 @@ import torch
 
 from go1exp import robot
 from go1exp.deploy.export.foreign import Back, Front
-from go1exp.deploy.export.graph import OPSET, OUTPUTS, ExportError, _exported, _quiet
+from go1exp.deploy.export.graph import OPSET, OUTPUTS, ExportError, exported, quiet
 from go1exp.deploy.runtime.metadata import Port
 
 
@@ -100,7 +100,7 @@ def _converted(file: Path, size: int | None) -> Any:
         raise ExportError(f"{file}: TorchScript does not say the size of its input; give spec=")
     probe, made = torch.linspace(-1, 1, 2 * size).reshape(2, size), io.BytesIO()
     try:
-        with torch.no_grad(), _quiet(), warnings.catch_warnings():
+        with torch.no_grad(), quiet(), warnings.catch_warnings():
             wanted = script(probe)
             if not torch.equal(wanted, script(probe)):
                 raise ExportError(f"{file}: gives other actions the second time: recurrent policies are not imported")
@@ -129,8 +129,8 @@ def compose_graph(front: Front, back: Back, network: Network) -> bytes:
     from onnx import compose as join
     from onnx import version_converter
 
-    head = _exported(front, front.inputs, ["observation", "network_input"])
-    tail = _exported(back, (Port("raw", robot.NUM_JOINTS, "1", "joint", ""),), ["joint_target", "action"])
+    head = exported(front, front.inputs, ["observation", "network_input"])
+    tail = exported(back, (Port("raw", robot.NUM_JOINTS, "1", "joint", ""),), ["joint_target", "action"])
     try:
         middle = version_converter.convert_version(network.model, OPSET)
     except Exception as error:  # the converter's are C++ exceptions without a class

@@ -80,6 +80,11 @@ OUTPUTS = (
 """Outputs of the graph; the observation's size is the policy's."""
 
 
+def outputs(size: int) -> tuple[Port, ...]:
+    """Return the outputs of a graph whose observation has ``size`` numbers."""
+    return tuple(dataclasses.replace(port, size=port.size or size) for port in OUTPUTS)
+
+
 class Sensed:
     """Stands in for a Snapshot, with only those fields that the robot measures.
 
@@ -158,8 +163,7 @@ class DeployedPolicy(nn.Module):
         self._earlier = [width(term) - frame_width(term) for term in terms]
         past = (dataclasses.replace(PAST, size=sum(self._earlier)),) if any(self._earlier) else ()
         self.inputs = (*required_inputs(terms), *past)
-        size = sum(block.size for block in blocks(terms))
-        self.outputs = tuple(dataclasses.replace(p, size=p.size or size) for p in OUTPUTS)
+        self.outputs = outputs(sum(map(width, terms)))
         self._terms, self._action = tuple(terms), action
         self.actor, self.head = network.mlp_extractor.policy_net, network.action_net
         self.register_buffer("nominal", torch.as_tensor(robot.NOMINAL_STANCE, dtype=torch.float32))
@@ -189,19 +193,19 @@ def to_onnx(module: DeployedPolicy) -> bytes:
     except ImportError as error:
         raise ExportError(f"export: needs {error.name}; pip install 'go1exp[export]'") from None
     try:
-        model = _exported(module, module.inputs, [port.name for port in module.outputs])
+        model = exported(module, module.inputs, [port.name for port in module.outputs])
     except torch.onnx.errors.OnnxExporterError as error:
         raise ExportError(f"observation{_culprit(module)}: has no form in ONNX ({_reason(error)})") from None
     onnx.checker.check_model(model, full_check=True)
     return bytes(model.SerializeToString())
 
 
-def _exported(module: nn.Module, inputs: Sequence[Port], outputs: Sequence[str]) -> Any:
+def exported(module: nn.Module, inputs: Sequence[Port], outputs: Sequence[str]) -> Any:
     """Export the module, and remove everything that depends on where and when it was exported."""
     example = tuple(torch.zeros(2, port.size) for port in inputs)
     # any number of rows: 1 on the robot, many in tests
     rows = torch.export.Dim("rows", min=1)
-    with _quiet(), torch.no_grad():
+    with quiet(), torch.no_grad():
         program = torch.onnx.export(
             module,
             example,
@@ -225,7 +229,7 @@ def _exported(module: nn.Module, inputs: Sequence[Port], outputs: Sequence[str])
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Suppress messages of torch's exporter: about torchvision, its own deprecated calls, and its progress."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
@@ -255,7 +259,7 @@ def _culprit(module: DeployedPolicy) -> str:
     for term in module._terms:
         inputs = required_inputs([term])
         try:
-            _exported(_OneTerm(term, inputs), inputs, [term.key])
+            exported(_OneTerm(term, inputs), inputs, [term.key])
         except torch.onnx.errors.OnnxExporterError:
             return f".{term.key}"
     return ""

@@ -10,9 +10,9 @@ from typing import Any, Protocol, cast
 import numpy as np
 
 from go1exp.deploy.runtime.bundle import Bundle
-from go1exp.deploy.runtime.packet_delay import PacketDelay
 from go1exp.deploy.runtime.policy import PolicyMemory
 from go1exp.deploy.runtime.safety import Safety
+from go1exp.deploy.runtime.udp import PacketDelay
 from go1exp.robot.messages import Link, LowCmd, LowState
 
 PHASES = ("waiting", "standing_up", "walking", "lying_down", "damping")

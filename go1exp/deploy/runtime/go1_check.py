@@ -16,9 +16,8 @@ import numpy as np
 from go1exp.deploy.estimation import FilterConfig
 from go1exp.deploy.estimation.feet import FootCalibration, calibrated, forces_by_torque, kinematics, vertical
 from go1exp.deploy.runtime import go1_wire
-from go1exp.deploy.runtime.packet_delay import delays, spread
 from go1exp.deploy.runtime.safety import SafetyConfig, tilt_angle
-from go1exp.deploy.runtime.udp import Go1Link
+from go1exp.deploy.runtime.udp import Go1Link, delays, spread
 from go1exp.robot.go1_fields import PERIOD
 from go1exp.robot.messages import LowState
 

@@ -45,7 +45,7 @@ class Job:
         robot: ``sim``, ``go1``, or the port of this machine at which a simulated robot already listens.
         plan: settings of the walk.
         out: folder of the logs.
-        sim: settings of the simulated robot (``go1exp.deploy.sim_robot.settings.SimConfig``).
+        sim: settings of the simulated robot (``go1exp.deploy.sim_robot.SimConfig``).
         other: its ``actuator`` and ``effect``, if not those of training.
         truth: also write the simulated trunk's true motion into the recording.
         mover: commands the robot in place of the bundle's policy.

@@ -60,7 +60,7 @@ class SimulatedRobot(contextlib.AbstractContextManager["SimulatedRobot"]):
 
         Args:
             bundle: the file; the robot in it is that of training.
-            sim: settings (``go1exp.deploy.sim_robot.settings.SimConfig``).
+            sim: settings (``go1exp.deploy.sim_robot.SimConfig``).
             other: choices of ``actuator`` and ``effect`` that replace those of training.
             port: where to listen; any that is free if 0.
             keep: newest seconds of the walk's log, for which truth and applied commands are kept too.

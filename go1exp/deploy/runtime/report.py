@@ -15,7 +15,7 @@ from go1exp.base.files import write_json
 from go1exp.deploy.runtime.bundle import Bundle
 from go1exp.deploy.runtime.controller import PHASES
 from go1exp.deploy.runtime.log import About, Log, write_cycles
-from go1exp.deploy.runtime.packet_delay import MOST_SLIP, delays, slip, spread
+from go1exp.deploy.runtime.udp import MOST_SLIP, delays, slip, spread
 from go1exp.deploy.runtime.walk import Outcome, Plan
 
 DONE = "walked to the end"

@@ -22,9 +22,9 @@ from pydantic import TypeAdapter, ValidationError
 from go1exp.base.errors import Expected
 from go1exp.config.schema.registry import ConfigError, as_json, explain
 from go1exp.deploy.runtime.bundle import CONFIG, MEMBERS, unpack
+from go1exp.deploy.sim_robot import SimConfig
 from go1exp.deploy.sim_robot.machine import Robot
 from go1exp.deploy.sim_robot.server import KEPT_S, TRUTH, Server
-from go1exp.deploy.sim_robot.settings import SimConfig
 from go1exp.robot import JOINTS
 from go1exp.sim.effects.rules import actuator_problems
 from go1exp.sim.task import TaskConfig, parse_parts, parse_train

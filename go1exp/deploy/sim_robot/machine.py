@@ -14,7 +14,7 @@ from go1exp.config.schema.physics import ContactConfig
 from go1exp.config.schema.registry import ConfigError, Term
 from go1exp.deploy.runtime.controller import LYING
 from go1exp.deploy.runtime.safety import DEFAULT_KD
-from go1exp.deploy.sim_robot.settings import SimConfig
+from go1exp.deploy.sim_robot import SimConfig
 from go1exp.robot.config import RobotConfig
 from go1exp.robot.messages import LowCmd, LowState
 from go1exp.sim.effects.base import Measured

@@ -21,9 +21,9 @@ from go1exp.deploy.runtime import go1_wire
 from go1exp.deploy.runtime.loop import MonotonicClock, Timing, run
 from go1exp.deploy.runtime.safety import DEFAULT_KD
 from go1exp.deploy.runtime.udp import HOST, arrival, enable_timestamps
+from go1exp.deploy.sim_robot import SimConfig
 from go1exp.deploy.sim_robot.machine import TICK, Robot
-from go1exp.deploy.sim_robot.settings import SimConfig
-from go1exp.robot.go1_fields import COMMAND_SIZE, LEGS
+from go1exp.robot.go1_fields import COMMAND_SIZE, JOINTS, LEGS
 from go1exp.robot.messages import LowCmd, LowState
 
 TICK_MS = 2
@@ -43,12 +43,6 @@ GONE_S = 1.0
 """Time without a packet after which a client is gone, and another one is accepted, s."""
 
 STRANGER = "another sender"
-
-APPLIED = ("commanded", *(f"q_target_{k}" for k in range(12)))
-"""Columns of the applied commands: whether one applied, and its targets."""
-
-CHUNK = 5000
-"""Rows of a block: 10 s."""
 
 KEPT_S = 60.0
 """Default time for which truth and applied commands are kept, s."""
@@ -84,28 +78,21 @@ class Network:
         return arrived
 
 
-class Truth:
-    """The newest rows of numbers by the robot's clock, kept in blocks so that no array is copied to grow."""
+class Newest:
+    """The newest rows of numbers by the robot's clock."""
 
-    def __init__(self, width: int = len(TRUTH), kept: float = KEPT_S) -> None:
-        """Keep at least the rows of the last ``kept`` s."""
-        blocks = math.ceil(kept / (CHUNK * TICK)) + 1
-        self._pieces = deque([np.zeros((CHUNK, 1 + width))], maxlen=blocks)
-        self._rows = 0
+    def __init__(self, width: int, kept: float) -> None:
+        """Keep the rows of ``width`` numbers of the last ``kept`` s."""
+        self._width = width
+        self._rows: deque[np.ndarray] = deque(maxlen=math.ceil(kept / TICK) + 1)
 
     def add(self, clock: float, values: np.ndarray) -> None:
         """Keep a row."""
-        if self._rows == CHUNK:
-            self._pieces.append(np.zeros_like(self._pieces[0]))
-            self._rows = 0
-        row = self._pieces[-1][self._rows]
-        row[0], row[1:] = clock, values
-        self._rows += 1
+        self._rows.append(np.array([clock, *values]))
 
     def rows(self) -> np.ndarray:
-        """Return what is kept: clock, and the columns, (T, 1 + width)."""
-        *whole, last = self._pieces
-        return np.concatenate([*whole, last[: self._rows]])
+        """Return what is kept: clock, and the values, (T, 1 + width)."""
+        return np.array(self._rows).reshape(-1, 1 + self._width)
 
 
 ZERO, SCALE = (100.0, 130.0), (0.5, 1.5)
@@ -216,7 +203,7 @@ class Server:
         counts: of packets.
         peer: address of the client; None before the first packet.
         truth: the newest of the trunk's true motion.
-        applied: the newest applied commands, in the columns of ``APPLIED``.
+        applied: the newest applied commands: whether one applied, and its targets, rad (``Robot.applied``).
         packets: packs states and unpacks commands.
         on_heard: called for each packet of ``peer`` with its time of arrival, s on ``time.perf_counter``'s clock.
         on_tick: called after each tick.
@@ -245,7 +232,7 @@ class Server:
         self.address: tuple[str, int] = self._socket.getsockname()
         self.peer: tuple[str, int] | None = None
         self._heard = -math.inf
-        self.counts, self.truth, self.applied = Counts(), Truth(kept=kept), Truth(len(APPLIED), kept)
+        self.counts, self.truth, self.applied = Counts(), Newest(len(TRUTH), kept), Newest(1 + JOINTS, kept)
 
     @property
     def port(self) -> int:

@@ -17,7 +17,7 @@ from go1exp.config.schema.registry import ConfigError
 from go1exp.deploy.estimation import Filters
 from go1exp.deploy.sim_robot.machine import noisy
 from go1exp.evaluate.controller.types import Command, Controller, Savable, Sensed, TrunkVelocity
-from go1exp.logs.record.tape import sample
+from go1exp.logs.record.simulate import sample
 from go1exp.robot.messages import LowCmd
 from go1exp.sim.env.core import Go1Core
 

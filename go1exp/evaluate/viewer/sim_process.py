@@ -22,10 +22,10 @@ from go1exp import robot
 from go1exp.base.errors import REFUSED, Expected
 from go1exp.base.signals import ending
 from go1exp.config.schema.registry import ConfigError
+from go1exp.deploy.sim_robot import SimConfig
 from go1exp.deploy.sim_robot.alone import Say, posture
 from go1exp.deploy.sim_robot.machine import TICK, Body, Robot
 from go1exp.deploy.sim_robot.server import GONE_S, Server
-from go1exp.deploy.sim_robot.settings import SimConfig
 from go1exp.evaluate.protocol.plan import Kicker, heading
 from go1exp.evaluate.viewer import requests as ask
 from go1exp.evaluate.viewer.requests import active, catalogue

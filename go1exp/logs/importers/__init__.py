@@ -14,18 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from go1exp.config.schema.registry import ConfigError, find, members, unknown_name
-from go1exp.logs.importers import arms, csv, mcap_joint_state, quadrupeds, scaler_walk_mocap, unitree_lowstate
+from go1exp.logs.importers import csv, published, ros, scaler_walk_mocap
 from go1exp.logs.recording import Recording, RecordingError
 
-__all__ = [
-    "arms",
-    "csv",
-    "import_recordings",
-    "mcap_joint_state",
-    "quadrupeds",
-    "scaler_walk_mocap",
-    "unitree_lowstate",
-]
+__all__ = ["csv", "import_recordings", "published", "ros", "scaler_walk_mocap"]
 
 
 def import_recordings(name: str, path: Path, options: Mapping[str, Any]) -> list[Recording]:

@@ -15,9 +15,8 @@ from typing import Any
 
 import numpy as np
 
-import go1exp.logs.importers.parquet as parquet
 from go1exp.base.wording import counted
-from go1exp.logs.importers.source import beginning, kind
+from go1exp.logs.importers.source import beginning, is_parquet, kind, parquet_columns, parquet_names
 from go1exp.logs.recording import RecordingError
 
 UTF8 = "utf-8"
@@ -94,7 +93,7 @@ class _NoNumber(ValueError):
 
 def names(path: Path, layout: Layout) -> list[str]:
     """Return the names of the columns: those of the first line, or 1, 2, 3; of a list, ``name[0]``, ``name[1]``."""
-    return list(parquet.column_names(path)) if parquet.is_parquet(path) else list(_text_names(path, layout))
+    return list(parquet_names(path)) if is_parquet(path) else list(_text_names(path, layout))
 
 
 def read(path: Path, wanted: Mapping[str, str], layout: Layout, labels: str | None = None) -> Table:
@@ -110,8 +109,8 @@ def read(path: Path, wanted: Mapping[str, str], layout: Layout, labels: str | No
         RecordingError: if it is no table, lacks a column, or holds what is no number; with every such column.
     """
     units: dict[str, str] = {}
-    if parquet.is_parquet(path):
-        present = list(parquet.column_names(path))
+    if is_parquet(path):
+        present = list(parquet_names(path))
     else:
         given = _text_names(path, layout)
         units = _units(path, layout, given)
@@ -124,12 +123,10 @@ def read(path: Path, wanted: Mapping[str, str], layout: Layout, labels: str | No
     existing = [name for name in wanted if name in present]
 
     def place(row: int) -> str:
-        return f"row {row}" if parquet.is_parquet(path) else f"line {line_of(path, row, layout)}"
+        return f"row {row}" if is_parquet(path) else f"line {line_of(path, row, layout)}"
 
     table = (
-        parquet.columns_of(path, existing)
-        if parquet.is_parquet(path)
-        else _text(path, {n: given[n] for n in existing}, layout)
+        parquet_columns(path, existing) if is_parquet(path) else _text(path, {n: given[n] for n in existing}, layout)
     )
     values: dict[str, np.ndarray] = {}
     other_sign: list[tuple[str, _NoNumber]] = []

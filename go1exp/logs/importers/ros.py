@@ -1,4 +1,4 @@
-"""Unitree's own ``LowState`` of a Go1 or Go2, and its ``LowCmd``, in an MCAP log; needs the extra ``logs``."""
+"""MCAP logs of ROS 2: JointState of any robot, LowState of a Unitree Go1 or Go2; needs the extra ``logs``."""
 
 from __future__ import annotations
 
@@ -10,22 +10,126 @@ import numpy as np
 from pydantic import AliasChoices, Field
 
 import go1exp.logs.importers.bags as bags
-from go1exp.config.schema.registry import Positive, importer
+from go1exp.config.schema.registry import NonNegative, Positive, importer
 from go1exp.logs.importers.source import columns, files, recording
 from go1exp.logs.recording import FOOT_FORCE, VECTORS, Quaternion, Recording, RecordingError
 from go1exp.robot import JOINTS, LEGS
 
 PACKAGES = ("unitree_go", "ros2_unitree_legged_msgs", "unitree_legged_msgs")
-"""Packages of ROS 2 that have these messages, of the Go2 first."""
+"""Packages of ROS 2 that have Unitree's messages, of the Go2 first."""
 
 STOP = 1e6
 """rad; the value by which a command says that it has no target, 2.146e9, lies above it."""
+
+Joints = tuple[int, tuple[Any, ...], tuple[str, ...], Mapping[str, Sequence[float]]]
+"""Stamp, ns, source, names and values of a message, as ``bags.Kind`` has them."""
 
 Vector = Annotated[tuple[float, ...], Field(min_length=3, max_length=3)]
 
 
 def _either(snake: str, camel: str) -> Any:
     return Field(validation_alias=AliasChoices(snake, camel))
+
+
+# ---------------------------------------- sensor_msgs/msg/JointState
+
+
+class _Stamp(bags.Decoded):
+    sec: int
+    nanosec: int = _either("nanosec", "nsec")
+
+
+class _Header(bags.Decoded):
+    stamp: _Stamp
+    frame_id: str = ""
+
+
+class _JointState(bags.Decoded):
+    header: _Header | None = None
+    name: tuple[str, ...]
+    position: tuple[float, ...] = ()
+    velocity: tuple[float, ...] = ()
+    effort: tuple[float, ...] = ()
+
+
+def _joints(state: _JointState) -> Joints:
+    head = state.header
+    stamp = head.stamp.sec * 10**9 + head.stamp.nanosec if head else 0
+    fields = {"position": state.position, "velocity": state.velocity, "effort": state.effort}
+    return stamp, (head.frame_id if head else "",), state.name, fields
+
+
+JOINT_STATE = bags.Kind(("sensor_msgs/msg/JointState", "sensor_msgs/JointState"), _JointState, _joints)
+
+
+@importer("mcap_joint_state")
+def mcap_joint_state(
+    path: Path,
+    *,
+    robot: str = "go1",
+    state_topic: str = "/joint_states",
+    command_topic: str | None = None,
+    joints: tuple[str, ...] | None = None,
+    base: Literal["fixed", "floating"] = "floating",
+    base_quat: Quaternion | None = None,
+    kp: tuple[NonNegative, ...] | None = None,
+    kd: tuple[NonNegative, ...] | None = None,
+    tau_limit: tuple[Positive, ...] | None = None,
+    excitation: str | None = None,
+    drop_repeats: bool = False,
+    cut: bool = False,
+) -> list[Recording]:
+    """Joint states, and commands if there are any, from the MCAP log of any ROS 2 robot.
+
+    State ``position``, ``velocity``, ``effort`` become ``q``, ``qd``, ``tau_est``; command ``position`` and ``effort``
+    become ``q_target`` and ``tau_cmd``, held from one command to the next; rows before the first command are left out.
+    A velocity or effort that is zero or NaN throughout is taken as not measured and has no column. Messages may be CDR
+    or JSON. Of several publishers on a topic, the one that has the joints, and moves, is taken; the notes name others.
+
+    Args:
+        path: a ``.mcap``, or a folder of them.
+        robot: name of the robot.
+        state_topic: topic of the measured joint states.
+        command_topic: topic of the commands, also JointState; None if there is none.
+        joints: which joints, in which order; by default those of the source that is taken (a Go1's in our order).
+        base: whether the base was ``fixed`` or ``floating``.
+        base_quat: attitude of a fixed base, w-x-y-z.
+        kp: position gains, N m/rad, in the order of ``joints``.
+        kd: velocity gains, N m s/rad.
+        tau_limit: torque limits, N m.
+        excitation: name of the motion.
+        drop_repeats: leave out messages with the time of the one before; the notes have their number.
+        cut: import the readable part of a damaged log.
+
+    Raises:
+        RecordingError: if the extra is not installed, the log is damaged, or a topic or joint is missing.
+    """
+    topics = {topic: JOINT_STATE for topic in (state_topic, command_topic) if topic is not None}
+    recordings = []
+    for file in files(path, "*.mcap"):
+        states, notes = bags.read(file, topics, cut)
+        names = joints or bags.joints_of(states[state_topic])
+        channels, _ = bags.channels(file, states, state_topic, command_topic, names, drop_repeats, notes)
+        recordings.append(
+            recording(
+                file,
+                "mcap_joint_state",
+                channels,
+                robot=robot,
+                joints=names,
+                base=base,
+                base_quat=base_quat,
+                kp=kp,
+                kd=kd,
+                tau_limit=tau_limit,
+                excitation=excitation,
+                notes=" ".join(notes),
+            )
+        )
+    return recordings
+
+
+# ---------------------------------------- LowState and LowCmd
 
 
 class _Motor(bags.Decoded):
@@ -57,9 +161,6 @@ class _LowCmd(bags.Decoded):
     motor_cmd: tuple[_MotorCommand, ...] = _either("motor_cmd", "motorCmd")
 
 
-Joints = tuple[int, tuple[Any, ...], tuple[str, ...], Mapping[str, Sequence[float]]]
-
-
 def _state(message: _LowState) -> Joints:
     motors = message.motor_state[: len(JOINTS)]  # the others are not used
     values = {"position": "q", "velocity": "dq", "effort": "tau_est"}
@@ -75,84 +176,57 @@ STATE = bags.Kind(tuple(f"{package}/msg/LowState" for package in PACKAGES), _Low
 COMMAND = bags.Kind(tuple(f"{package}/msg/LowCmd" for package in PACKAGES), _LowCmd, _command)
 
 
-@importer("unitree_lowstate_go1")
-def unitree_lowstate_go1(
-    path: Path,
-    *,
-    state_topic: str = "/low_state",
-    command_topic: str | None = None,
-    base: Literal["fixed", "floating"] = "floating",
-    base_quat: Quaternion | None = None,
-    foot_newton: Positive | None = None,
-    foot_zero: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
-    excitation: str | None = None,
-    drop_repeats: bool = False,
-    cut: bool = False,
-) -> list[Recording]:
-    """LowState, and LowCmd if there is any, of a Unitree Go1 from the MCAP log of a ROS 2 node.
+def _lowstate_importer(robot: str, topic: str) -> None:
+    """Register the importer of a robot whose nodes send LowState on ``topic``."""
 
-    Motors 0 to 11 are FR, FL, RR, RL x hip, thigh, calf: our order. Commands are held from one to the next; their gains
-    are those of the recording if they never change. t is the time of logging, as the message has no stamp.
+    def unitree_lowstate(
+        path: Path,
+        *,
+        state_topic: str = topic,
+        command_topic: str | None = None,
+        base: Literal["fixed", "floating"] = "floating",
+        base_quat: Quaternion | None = None,
+        foot_newton: Positive | None = None,
+        foot_zero: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
+        excitation: str | None = None,
+        drop_repeats: bool = False,
+        cut: bool = False,
+    ) -> list[Recording]:
+        about = {"robot": robot, "base": base, "base_quat": base_quat, "excitation": excitation}
+        foot = (foot_newton, foot_zero)
+        logs = files(path, "*.mcap")
+        return [_lowstate(file, state_topic, command_topic, foot, drop_repeats, cut, about) for file in logs]
 
-    Args:
-        path: a ``.mcap``, or a folder of them.
-        state_topic: topic of LowState.
-        command_topic: topic of LowCmd; None if there is none.
-        base: whether the base was ``fixed`` or ``floating``.
-        base_quat: attitude of a fixed base, w-x-y-z.
-        foot_newton: force of one count of ``foot_force``, N; null leaves the feet out, as counts have no unit.
-        foot_zero: counts of each unloaded foot, FR, FL, RR, RL.
-        excitation: name of the motion.
-        drop_repeats: leave out messages with the time of the one before; the notes have their number.
-        cut: import the readable part of a damaged log.
-
-    Raises:
-        RecordingError: if the extra is not installed, the log is damaged, or a topic or motor is missing.
-    """
-    about = {"robot": "go1", "base": base, "base_quat": base_quat, "excitation": excitation}
-    foot = (foot_newton, foot_zero)
-    return [_one(file, state_topic, command_topic, foot, drop_repeats, cut, about) for file in files(path, "*.mcap")]
+    unitree_lowstate.__doc__ = LOWSTATE.format(robot=robot.capitalize(), command=topic.replace("state", "cmd"))
+    importer(f"unitree_lowstate_{robot}")(unitree_lowstate)
 
 
-@importer("unitree_lowstate_go2")
-def unitree_lowstate_go2(
-    path: Path,
-    *,
-    state_topic: str = "/lowstate",
-    command_topic: str | None = None,
-    base: Literal["fixed", "floating"] = "floating",
-    base_quat: Quaternion | None = None,
-    foot_newton: Positive | None = None,
-    foot_zero: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
-    excitation: str | None = None,
-    drop_repeats: bool = False,
-    cut: bool = False,
-) -> list[Recording]:
-    """LowState, and LowCmd if there is any, of a Unitree Go2 from an MCAP log: ``ros2 bag record -s mcap /lowstate``.
+LOWSTATE = """LowState, and LowCmd if there is any, of a Unitree {robot} from the MCAP log of a ROS 2 node.
 
-    The Go2 has the joints of the Go1 in the same order, on 12 of 20 motors; they get our names. ``robot`` is ``go2``.
+Motors 0 to 11 are FR, FL, RR, RL x hip, thigh, calf: our order and names. Commands are held from one to the next; their
+gains are those of the recording if they never change. t is the time of logging, as the message has no stamp.
 
-    Args:
-        path: a ``.mcap``, or a folder of them.
-        state_topic: topic of LowState.
-        command_topic: topic of LowCmd, such as /lowcmd; None if there is none.
-        base: whether the base was ``fixed`` or ``floating``.
-        base_quat: attitude of a fixed base, w-x-y-z.
-        foot_newton: force of one count of ``foot_force``, N; null leaves the feet out, as counts have no unit.
-        foot_zero: counts of each unloaded foot, FR, FL, RR, RL.
-        excitation: name of the motion.
-        drop_repeats: leave out messages with the time of the one before; the notes have their number.
-        cut: import the readable part of a damaged log.
+Args:
+    path: a ``.mcap``, or a folder of them.
+    state_topic: topic of LowState.
+    command_topic: topic of LowCmd, such as {command}; None if there is none.
+    base: whether the base was ``fixed`` or ``floating``.
+    base_quat: attitude of a fixed base, w-x-y-z.
+    foot_newton: force of one count of ``foot_force``, N; null leaves the feet out, as counts have no unit.
+    foot_zero: counts of each unloaded foot, FR, FL, RR, RL.
+    excitation: name of the motion.
+    drop_repeats: leave out messages with the time of the one before; the notes have their number.
+    cut: import the readable part of a damaged log.
 
-    Raises:
-        RecordingError: if the extra is not installed, the log is damaged, or a topic or motor is missing.
-    """
-    about = {"robot": "go2", "base": base, "base_quat": base_quat, "excitation": excitation}
-    foot = (foot_newton, foot_zero)
-    return [_one(file, state_topic, command_topic, foot, drop_repeats, cut, about) for file in files(path, "*.mcap")]
+Raises:
+    RecordingError: if the extra is not installed, the log is damaged, or a topic or motor is missing.
+"""
+
+_lowstate_importer("go1", "/low_state")
+_lowstate_importer("go2", "/lowstate")
 
 
-def _one(
+def _lowstate(
     path: Path,
     state_topic: str,
     command_topic: str | None,
