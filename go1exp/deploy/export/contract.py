@@ -106,7 +106,7 @@ def _outcomes(errors: np.ndarray, fall: np.ndarray) -> list[Outcome]:
 
 
 def drive(
-    config: TrainConfig, specs: Sequence[Spec], network: Network, seconds: float = SECONDS
+    config: TrainConfig, specs: Sequence[Spec], network: Network
 ) -> tuple[list[Outcome], dict[str, np.ndarray], np.ndarray]:
     """Run robots under each contract.
 
@@ -115,7 +115,7 @@ def drive(
         robot that stands, rad, (12,) in the order of ``JOINTS``.
     """
     each, period = len(COMMANDS), config.task.sim.policy_dt
-    sim = dataclasses.replace(config.task.sim, episode_s=2 * seconds, spread_starts=False)
+    sim = dataclasses.replace(config.task.sim, episode_s=2 * SECONDS, spread_starts=False)
     core = Go1Core(dataclasses.replace(config.task, sim=sim), each * len(specs), noise=False)
     core.reset()
     commands = torch.tensor(COMMANDS).repeat(len(specs), 1)
@@ -124,7 +124,7 @@ def drive(
     fall = np.full(len(commands), np.inf)
     errors: list[np.ndarray] = []
     rows: list[dict[str, np.ndarray]] = []
-    for step in range(round(seconds / period)):
+    for step in range(round(SECONDS / period)):
         core.command.value.copy_(commands)
         now = readings(core)
         raw = torch.from_numpy(network(torch.cat([group.observe(now) for group in groups]).numpy()))

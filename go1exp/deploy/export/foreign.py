@@ -9,7 +9,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -23,9 +23,8 @@ from go1exp.config.hydra_adapter import read_yaml
 from go1exp.config.schema import settings as schema
 from go1exp.config.schema.history import frame_width, frames_of, width
 from go1exp.config.schema.joint_values import JointValues, spread
-from go1exp.config.schema.registry import ConfigError, Positive, Term, unknown_name
-from go1exp.deploy.export.graph import PAST, Sensed, required_inputs
-from go1exp.mdp.types import Snapshot
+from go1exp.config.schema.registry import ConfigError, Positive, unknown_name
+from go1exp.deploy.export.graph import Observing, computed
 from go1exp.sim.task import TrainConfig, parse_train
 
 ORDERS = {
@@ -258,13 +257,12 @@ def _stance(spec: Spec) -> np.ndarray:
     return np.array([STANCE[robot.JOINTS.index(name)] for name in spec.names])
 
 
-class Front(nn.Module):
+class Front(Observing):
     """Sensor readings to the flat observation, a frame after the other in each term, and to the network's input."""
 
     def __init__(self, spec: Spec, config: TrainConfig) -> None:
         """Prepare the terms; raise ConfigError or ExportError if one does not fit."""
-        super().__init__()
-        self._terms: tuple[Term, ...] = config.task.observation
+        super().__init__(config.task.observation)
         self._spec, unit = spec, config.task.action.scale
         order = [robot.JOINTS.index(name) for name in spec.names]
         sign, pose, stance = spec.joints("joint_sign"), spec.joints("default_pose"), _stance(spec)
@@ -285,10 +283,6 @@ class Front(nn.Module):
                 shift = sign * stance
             law = (torch.as_tensor(v, dtype=torch.float32) for v in (gain, shift, factor * np.ones(size)))
             self._laws.append((order if per_joint else list(range(size)), *law))  # type: ignore[arg-type]
-        self._earlier = [width(t) - frame_width(t) for t in self._terms]
-        self.size = sum(map(width, self._terms))
-        past = (dataclasses.replace(PAST, size=sum(self._earlier)),) if any(self._earlier) else ()
-        self.inputs = (*required_inputs(self._terms), *past)
         self._columns = self._layout()
 
     def _layout(self) -> list[int]:
@@ -306,10 +300,10 @@ class Front(nn.Module):
 
     def forward(self, *readings: Tensor) -> tuple[Tensor, Tensor]:
         """Return observation and network input, (N, O) each, for readings (N, size)."""
-        given = dict(zip([port.name for port in self.inputs], readings, strict=True))
+        given = self._named(readings)
         frames = []
         for term, observed, law in zip(self._terms, self._spec.observation, self._laws, strict=True):
-            value = term(cast(Snapshot, Sensed(_attitude(given, observed.quaternion), term.key)))
+            value = computed(term, _attitude(given, observed.quaternion))
             columns, gain, shift, factor = law
             changed = value[:, columns] * gain + shift
             if term.entry.name == "previous_action" and self._offset:  # there was none before the first step
@@ -319,9 +313,7 @@ class Front(nn.Module):
             changed = changed * factor
             bound = self._spec.observation_clip
             frames.append(changed if bound is None else changed.clamp(-bound, bound))
-        if any(self._earlier):
-            frames = [torch.cat(p, -1) for p in zip(frames, given["past"].split(self._earlier, -1), strict=True)]
-        observation = torch.cat(frames, dim=-1)
+        observation = self._flat(frames, given)
         return observation, observation[:, self._columns]
 
 

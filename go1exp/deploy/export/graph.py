@@ -95,7 +95,7 @@ class Sensed:
         ExportError: where a term reads another field.
     """
 
-    def __init__(self, readings: Mapping[str, Tensor], term: str = "observation") -> None:
+    def __init__(self, readings: Mapping[str, Tensor], term: str) -> None:
         """Take readings (N, size) by name; ``term`` is named in errors."""
         self._readings, self._term = readings, term
         self.read: set[str] = set()
@@ -143,11 +143,43 @@ def required_inputs(terms: Sequence[Term]) -> tuple[Port, ...]:
     return tuple(port for port in READINGS if port.name in read)
 
 
-class DeployedPolicy(nn.Module):
+class Observing(nn.Module):
+    """Observation terms as a module.
+
+    Attributes:
+        inputs: readings that the terms need, and ``past`` if one has a history.
+        size: of the flat observation.
+    """
+
+    def __init__(self, terms: Sequence[Term]) -> None:
+        """Take the terms; raise ExportError if one reads what the robot does not measure."""
+        super().__init__()
+        self._terms = tuple(terms)
+        self._earlier = [width(term) - frame_width(term) for term in terms]
+        past = (dataclasses.replace(PAST, size=sum(self._earlier)),) if any(self._earlier) else ()
+        self.inputs = (*required_inputs(terms), *past)
+        self.size = sum(map(width, terms))
+
+    def _named(self, readings: Sequence[Tensor]) -> dict[str, Tensor]:
+        return dict(zip([port.name for port in self.inputs], readings, strict=True))
+
+    def _flat(self, frames: Sequence[Tensor], given: Mapping[str, Tensor]) -> Tensor:
+        """Return the observation (N, size) of the newest frames (N, ...) of all terms and those in ``given``'s past."""
+        if any(self._earlier):
+            earlier = given["past"].split(self._earlier, dim=-1)
+            frames = [torch.cat(pair, dim=-1) for pair in zip(frames, earlier, strict=True)]
+        return torch.cat(list(frames), dim=-1)
+
+
+def computed(term: Term, given: Mapping[str, Tensor]) -> Tensor:
+    """Return a term (N, size) of readings (N, ...) by name."""
+    return cast(Tensor, term(cast(Snapshot, Sensed(given, term.key))))
+
+
+class DeployedPolicy(Observing):
     """The graph as a torch module.
 
     Attributes:
-        inputs: of ``forward``, in order.
         outputs: of ``forward``, in order.
     """
 
@@ -159,24 +191,16 @@ class DeployedPolicy(nn.Module):
         Raises:
             ExportError: if a term reads what the robot does not measure.
         """
-        super().__init__()
-        self._earlier = [width(term) - frame_width(term) for term in terms]
-        past = (dataclasses.replace(PAST, size=sum(self._earlier)),) if any(self._earlier) else ()
-        self.inputs = (*required_inputs(terms), *past)
-        self.outputs = outputs(sum(map(width, terms)))
-        self._terms, self._action = tuple(terms), action
+        super().__init__(terms)
+        self.outputs, self._action = outputs(self.size), action
         self.actor, self.head = network.mlp_extractor.policy_net, network.action_net
         self.register_buffer("nominal", torch.as_tensor(robot.NOMINAL_STANCE, dtype=torch.float32))
         self.eval()
 
     def forward(self, *readings: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return joint targets (N, 12), observation (N, O) and clipped action (N, 12) for readings (N, size)."""
-        given = dict(zip([port.name for port in self.inputs], readings, strict=True))
-        frames = [term(cast(Snapshot, Sensed(given, term.key))) for term in self._terms]
-        if any(self._earlier):
-            earlier = given["past"].split(self._earlier, dim=-1)
-            frames = [torch.cat(pair, dim=-1) for pair in zip(frames, earlier, strict=True)]
-        observation = torch.cat(frames, dim=-1)
+        given = self._named(readings)
+        observation = self._flat([computed(term, given) for term in self._terms], given)
         action = clipped(self.head(self.actor(observation)), self._action.clip)
         return joint_target(action, self.nominal, self._action.scale), observation, action
 
@@ -250,8 +274,7 @@ class _OneTerm(nn.Module):
         self._term, self._names = term, [port.name for port in inputs]
 
     def forward(self, *readings: Tensor) -> Tensor:
-        given = dict(zip(self._names, readings, strict=True))
-        return cast(Tensor, self._term(cast(Snapshot, Sensed(given, self._term.key))))
+        return computed(self._term, dict(zip(self._names, readings, strict=True)))
 
 
 def _culprit(module: DeployedPolicy) -> str:

@@ -7,7 +7,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -162,7 +162,7 @@ def run_job(job: Job, say: Say) -> int:
             raise
         say("stopped before the walk began: nothing was commanded")
         return STATUS["operator_stop"]
-    extra: dict[str, Any] = {"robot": job.robot, "link": link.traffic.counts()}
+    extra: dict[str, Any] = {"robot": job.robot, "link": asdict(link.traffic)}
     truth: Mapping[str, np.ndarray] = {}
     if process is not None:
         truth, extra["simulated_robot"] = process.truth, process.report

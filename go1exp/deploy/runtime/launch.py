@@ -53,16 +53,13 @@ class SimulatedRobot(contextlib.AbstractContextManager["SimulatedRobot"]):
         applied: the applied commands, after ``close``: rows of clock, s, whether one applied, and its targets, rad.
     """
 
-    def __init__(
-        self, bundle: str, sim: Mapping[str, Any], other: Mapping[str, Any], port: int = 0, keep: float = 120.0
-    ) -> None:
+    def __init__(self, bundle: str, sim: Mapping[str, Any], other: Mapping[str, Any], keep: float = 120.0) -> None:
         """Start it and wait until it listens.
 
         Args:
             bundle: the file; the robot in it is that of training.
             sim: settings (``go1exp.deploy.sim_robot.SimConfig``).
             other: choices of ``actuator`` and ``effect`` that replace those of training.
-            port: where to listen; any that is free if 0.
             keep: newest seconds of the walk's log, for which truth and applied commands are kept too.
 
         Raises:
@@ -81,8 +78,8 @@ class SimulatedRobot(contextlib.AbstractContextManager["SimulatedRobot"]):
         self.report: dict[str, Any] = {}
         self.truth: dict[str, np.ndarray] = {}
         self.applied: np.ndarray | None = None
-        given = {"bundle": bundle, "sim": dict(sim), "robot": dict(other), "port": port, "truth": str(self._truth)}
-        given["kept"] = SPARE * keep + SPARE_S
+        given: dict[str, Any] = {"bundle": bundle, "sim": dict(sim), "robot": dict(other)}
+        given |= {"truth": str(self._truth), "kept": SPARE * keep + SPARE_S}
         assert self._process.stdin is not None
         try:
             self._process.stdin.write((json.dumps(given) + "\n").encode())

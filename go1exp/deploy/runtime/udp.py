@@ -10,7 +10,6 @@ import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -75,10 +74,6 @@ class Traffic:
     lost: int = 0
     refused: int = 0
 
-    def counts(self) -> dict[str, Any]:
-        """Return the counts by name."""
-        return dict(vars(self))
-
 
 class Go1Link:
     """A link to a Go1, or to the simulated robot; no call waits.
@@ -94,7 +89,7 @@ class Go1Link:
         newest: packet of the last accepted state; empty before the first.
     """
 
-    def __init__(self, host: str = ROBOT, port: int = ROBOT_PORT, tick_s: float = math.nan) -> None:
+    def __init__(self, host: str, port: int, tick_s: float = math.nan) -> None:
         """Open the socket; nothing is sent yet; raise OSError if the socket cannot be opened."""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:

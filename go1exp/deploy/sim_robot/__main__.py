@@ -88,7 +88,7 @@ def main() -> int:
     try:
         config = sim_config(given.get("sim", {}))
         task = bundle_task(given["bundle"], given.get("robot", {}))
-        server = Server(Robot(task, config), config, given.get("port", 0), kept=given.get("kept", KEPT_S))
+        server = Server(Robot(task, config), config, kept=given.get("kept", KEPT_S))
     except (ConfigError, Expected, OSError) as error:
         lines = error.problems if isinstance(error, ConfigError) else []
         _say("refused", message=str(error), problems=lines)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -176,8 +176,30 @@ STATE = bags.Kind(tuple(f"{package}/msg/LowState" for package in PACKAGES), _Low
 COMMAND = bags.Kind(tuple(f"{package}/msg/LowCmd" for package in PACKAGES), _LowCmd, _command)
 
 
-def _lowstate_importer(robot: str, topic: str) -> None:
-    """Register the importer of a robot whose nodes send LowState on ``topic``."""
+_LOWSTATE = """
+
+Motors 0 to 11 are FR, FL, RR, RL x hip, thigh, calf: our order and names. Commands are held from one to the next; their
+gains are those of the recording if they never change. t is the time of logging, as the message has no stamp.
+
+Args:
+    path: a ``.mcap``, or a folder of them.
+    state_topic: topic of LowState.
+    command_topic: topic of LowCmd, such as /lowcmd; None if there is none.
+    base: whether the base was ``fixed`` or ``floating``.
+    base_quat: attitude of a fixed base, w-x-y-z.
+    foot_newton: force of one count of ``foot_force``, N; null leaves the feet out, as counts have no unit.
+    foot_zero: counts of each unloaded foot, FR, FL, RR, RL.
+    excitation: name of the motion.
+    drop_repeats: leave out messages with the time of the one before; the notes have their number.
+    cut: import the readable part of a damaged log.
+
+Raises:
+    RecordingError: if the extra is not installed, the log is damaged, or a topic or motor is missing.
+"""
+
+
+def _importer_of(*, robot: str, topic: str) -> Callable[[Callable[[], None]], Callable[..., list[Recording]]]:
+    """Decorator: in place of an empty function comes the importer of a robot that sends LowState on ``topic``."""
 
     def unitree_lowstate(
         path: Path,
@@ -197,33 +219,23 @@ def _lowstate_importer(robot: str, topic: str) -> None:
         logs = files(path, "*.mcap")
         return [_lowstate(file, state_topic, command_topic, foot, drop_repeats, cut, about) for file in logs]
 
-    unitree_lowstate.__doc__ = LOWSTATE.format(robot=robot.capitalize(), command=topic.replace("state", "cmd"))
-    importer(f"unitree_lowstate_{robot}")(unitree_lowstate)
+    def documented(empty: Callable[[], None]) -> Callable[..., list[Recording]]:
+        unitree_lowstate.__doc__ = f"{empty.__doc__}{_LOWSTATE}"
+        return unitree_lowstate
+
+    return documented
 
 
-LOWSTATE = """LowState, and LowCmd if there is any, of a Unitree {robot} from the MCAP log of a ROS 2 node.
+@importer("unitree_lowstate_go1")
+@_importer_of(robot="go1", topic="/low_state")
+def unitree_lowstate_go1() -> None:
+    """LowState, and LowCmd if there is any, of a Unitree Go1 from the MCAP log of a ROS 2 node."""
 
-Motors 0 to 11 are FR, FL, RR, RL x hip, thigh, calf: our order and names. Commands are held from one to the next; their
-gains are those of the recording if they never change. t is the time of logging, as the message has no stamp.
 
-Args:
-    path: a ``.mcap``, or a folder of them.
-    state_topic: topic of LowState.
-    command_topic: topic of LowCmd, such as {command}; None if there is none.
-    base: whether the base was ``fixed`` or ``floating``.
-    base_quat: attitude of a fixed base, w-x-y-z.
-    foot_newton: force of one count of ``foot_force``, N; null leaves the feet out, as counts have no unit.
-    foot_zero: counts of each unloaded foot, FR, FL, RR, RL.
-    excitation: name of the motion.
-    drop_repeats: leave out messages with the time of the one before; the notes have their number.
-    cut: import the readable part of a damaged log.
-
-Raises:
-    RecordingError: if the extra is not installed, the log is damaged, or a topic or motor is missing.
-"""
-
-_lowstate_importer("go1", "/low_state")
-_lowstate_importer("go2", "/lowstate")
+@importer("unitree_lowstate_go2")
+@_importer_of(robot="go2", topic="/lowstate")
+def unitree_lowstate_go2() -> None:
+    """LowState, and any LowCmd, of a Unitree Go2 from an MCAP log: ``ros2 bag record -s mcap /lowstate``."""
 
 
 def _lowstate(

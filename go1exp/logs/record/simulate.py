@@ -67,11 +67,6 @@ class Tape:
         self.enabled = torch.ones(len(plant.q), dtype=torch.bool)
         plant.observer = self._listen
 
-    @property
-    def full(self) -> bool:
-        """Whether all rows have been taken."""
-        return self._step >= self._every * self._rows
-
     def stop(self) -> None:
         """Stop observing."""
         self._plant.observer = None
@@ -82,8 +77,8 @@ class Tape:
 
     def _listen(self, target: Tensor) -> None:
         """Take a sample before a step; ``target`` is in force from this step on."""
-        if self._step % self._every == 0 and not self.full:
-            row = self._step // self._every
+        row, rest = divmod(self._step, self._every)
+        if rest == 0 and row < self._rows:
             for name, value in (sample(self._plant, target) | {"torque_enable": self.enabled}).items():
                 now = value.cpu().numpy()
                 if name not in self._kept:
