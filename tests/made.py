@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from go1exp import robot
 from go1exp.logs.recording import Meta
-from go1exp.robot.messages import LowState
+from go1exp.robot.messages import LowCmd, LowState
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 
@@ -28,3 +29,15 @@ def low_state(t: float = 0.0, **changes: Any) -> LowState:
     usual |= {"joint_torque": np.zeros(12), "imu_quat": np.array(LEVEL), "imu_gyro": np.zeros(3)}
     usual |= {"imu_acc": np.array([0.0, 0.0, 9.81]), "foot_force": np.full(4, 30.0)}
     return LowState(t, **(usual | changes))
+
+
+def low_cmd(**changes: Any) -> LowCmd:
+    """Return a command that holds the nominal stance, with changes."""
+    return dataclasses.replace(LowCmd(robot.NOMINAL_STANCE.copy(), np.full(12, 20.0), np.full(12, 0.5)), **changes)
+
+
+def at(values: np.ndarray, k: int, value: float) -> np.ndarray:
+    """Return values of which the one at ``k`` is another."""
+    changed = np.array(values, dtype=float)
+    changed[k] = value
+    return changed

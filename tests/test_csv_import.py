@@ -364,11 +364,17 @@ def test_a_wrong_file_of_columns_is_told(tmp_path: Path, text: str | None, said:
 ARM = ["record", "import", "csv", "one", "options=lä/arm.yaml"]
 
 
+def arm(folder: Path, columns: str) -> Path:
+    """Make folders and the options of ``ARM``; return where its table comes."""
+    for name in ("one", "lä"):
+        (folder / name).mkdir()
+    (folder / "lä" / "arm.yaml").write_text(f"robot: arm\ncolumns: {columns}\n")
+    return folder / "one" / "a.csv"
+
+
 def test_what_an_import_replaces_is_told_and_two_files_of_one_name_are_renamed(tmp_path: Path) -> None:
-    for folder in ("one", "two", "lä"):
-        (tmp_path / folder).mkdir()
-    (tmp_path / "lä" / "arm.yaml").write_text("robot: arm\ncolumns: {t: {column: stamp, unit: ms}, q_knee: goal}\n")
-    lay(tmp_path / "one" / "a.csv")
+    lay(arm(tmp_path, "{t: {column: stamp, unit: ms}, q_knee: goal}"))
+    (tmp_path / "two").mkdir()
     lay(tmp_path / "two" / "a.csv")
     first, again = (run(tmp_path, *ARM, "out=o") for _ in range(2))
     assert (first.returncode, again.returncode) == (0, 0)
@@ -381,14 +387,25 @@ def test_what_an_import_replaces_is_told_and_two_files_of_one_name_are_renamed(t
     assert sorted(p.name for p in (tmp_path / "both").iterdir()) == ["one_a.parquet", "two_a.parquet"]
 
 
-def test_an_import_asks_for_the_unit_of_short_steps(tmp_path: Path) -> None:
-    (tmp_path / "lä").mkdir()
-    (tmp_path / "one").mkdir()
-    (tmp_path / "lä" / "arm.yaml").write_text("robot: arm\ncolumns: {t: {column: stamp, unit: ms}, q_knee: q}\n")
-    clocked(tmp_path / "one" / "a.csv", 0.004 * K)
+SHORT = ("note: a: t steps by 4e-06 s (median); a log of joints must step by at least 5e-05 s", "unit: s}")
+LONG = (
+    "note: a: t steps by 4 s (median); a log of joints must step by at most 0.1 s. Is it in milliseconds?",
+    "unit: ms",
+)
+
+
+@pytest.mark.parametrize(
+    ("stamp", "factor", "noted"),
+    [("{column: stamp, unit: ms}", 1.0, SHORT), ("stamp", 1000.0, LONG), ("stamp", 1.0, ())],
+)
+def test_an_import_asks_for_the_unit_of_short_and_long_steps(
+    tmp_path: Path, stamp: str, factor: float, noted: tuple[str, ...]
+) -> None:
+    clocked(arm(tmp_path, f"{{t: {stamp}, q_knee: q}}"), factor * 0.004 * K)
     done = run(tmp_path, *ARM, "out=o")
-    assert "note: a: t steps by 4e-06 s (median); a log of joints must step by at least 5e-05 s" in done.stdout
-    assert "unit: s}" in done.stdout
+    assert done.returncode == 0
+    for line in (*SHORT, *LONG):
+        assert (line in done.stdout) == (line in noted)
 
 
 def test_a_folder_gives_its_files_whatever_the_case_of_their_ending(tmp_path: Path) -> None:
@@ -407,19 +424,6 @@ def test_a_file_without_names_of_columns_is_asked_about(tmp_path: Path, second: 
     (tmp_path / "a.csv").write_text(f"0.0,{second}\n0.1,0.2\n")
     with pytest.raises(RecordingError, match=r"first line numbers, not names\? Then give header: false"):
         import_recordings("csv", tmp_path, {"robot": "arm", "columns": {"t": "stamp", "q_knee": "q"}})
-
-
-@pytest.mark.parametrize(("factor", "noted"), [(1000.0, True), (1.0, False)])
-def test_an_import_asks_for_the_unit_of_long_steps(tmp_path: Path, factor: float, noted: bool) -> None:
-    (tmp_path / "lä").mkdir()
-    (tmp_path / "one").mkdir()
-    (tmp_path / "lä" / "arm.yaml").write_text("robot: arm\ncolumns: {t: stamp, q_knee: q}\n")
-    clocked(tmp_path / "one" / "a.csv", factor * 0.004 * K)
-    done = run(tmp_path, *ARM, "out=o")
-    assert done.returncode == 0
-    line = "note: a: t steps by 4 s (median); a log of joints must step by at most 0.1 s. Is it in milliseconds?"
-    assert (line in done.stdout) == noted
-    assert ("unit: ms" in done.stdout) == noted
 
 
 def test_a_clock_that_begins_anew_and_a_column_of_episodes_separate_recordings(tmp_path: Path) -> None:

@@ -41,7 +41,7 @@ from go1exp.logs import recording
 from go1exp.robot.go1_fields import STATE_SIZE
 from go1exp.robot.messages import LowState
 from tests.lockstep import World, lockstep
-from tests.made import low_state
+from tests.made import at, low_cmd, low_state
 
 
 def play(bundle: str, out: Path, meddle: Callable[[World], None] = lambda world: None, **sim: Any) -> SimpleNamespace:
@@ -242,13 +242,6 @@ def speakers(count: int) -> Iterator[list[socket.socket]]:
         one.close()
 
 
-def stance_command(**changes: Any) -> bytes:
-    from go1exp.robot.messages import LowCmd
-
-    usual = {"joint_target": robot.NOMINAL_STANCE.copy(), "kp": np.full(12, 20.0), "kd": np.full(12, 0.5)}
-    return wire.pack_command(LowCmd(**{**usual, **changes}))
-
-
 def test_a_robot_answers_the_first_who_speaks_and_refuses_and_counts_the_others(bundle: str) -> None:
     made = server(bundle)
     with speakers(2) as (first, second):
@@ -259,7 +252,7 @@ def test_a_robot_answers_the_first_who_speaks_and_refuses_and_counts_the_others(
         assert made.peer is None
         assert made.counts.refused == {"wrong size": 2, "wrong head": 1, "wrong checksum": 1}
         first.sendto(wire.IDLE, to)
-        second.sendto(stance_command(joint_target=robot.NOMINAL_STANCE + 0.5), to)
+        second.sendto(wire.pack_command(low_cmd(joint_target=robot.NOMINAL_STANCE + 0.5)), to)
         made.tick()
         assert made.peer == first.getsockname()
         assert made.counts.refused[STRANGER] == 1
@@ -268,7 +261,7 @@ def test_a_robot_answers_the_first_who_speaks_and_refuses_and_counts_the_others(
         assert wire.refusal(packet, STATE_SIZE) is None
         for _ in range(round(GONE_S / TICK) + 2):
             made.tick()
-        second.sendto(stance_command(), to)
+        second.sendto(wire.pack_command(low_cmd()), to)
         made.tick()
         assert made.peer == second.getsockname()  # the first has been silent for a second
         assert made.counts.commands == 1
@@ -283,7 +276,7 @@ def test_a_robot_holds_its_pose_until_a_command_and_brakes_when_nobody_speaks(bu
             client.sendto(wire.IDLE, to)
             made.tick()
         assert made.robot.truth[2] > 0.25  # it stands, as by its maker's own controller
-        client.sendto(stance_command(), to)
+        client.sendto(wire.pack_command(low_cmd()), to)
         made.tick()
         for tick in range(round(SILENCE / TICK) + 3):
             assert made.robot.braking == (tick * TICK > SILENCE + 1e-9), tick
@@ -443,12 +436,6 @@ def heard_of(**changes: Any) -> Observed:
     return Observed(1.0, states, [(2 * k, 0.002 * k) for k in range(500)], health)
 
 
-def at(k: int, value: float, rest: np.ndarray) -> np.ndarray:
-    values = np.array(rest, float)
-    values[k] = value
-    return values
-
-
 @pytest.mark.parametrize(
     ("changes", "problem"),
     [
@@ -456,9 +443,9 @@ def at(k: int, value: float, rest: np.ndarray) -> np.ndarray:
         ({"period": 0.005}, "packets: 200 per second; at least 400"),
         ({"health": wire.Health(charge=19)}, "battery: 19 %; at least 20 %"),
         ({"health": wire.Health(motor_temperature=(30,) * 5 + (66,) + (30,) * 6)}, "temperature: FL_calf has 66 °C"),
-        ({"joint_pos": at(3, 1.0, robot.NOMINAL_STANCE)}, "joints: FL_hip is at 1.000 rad; its range is -0.863"),
-        ({"joint_pos": at(3, np.nan, robot.NOMINAL_STANCE)}, "joints: FL_hip is at nan rad"),
-        ({"joint_vel": at(2, 1.5, np.zeros(12))}, "joints: FR_calf moves at 1.50 rad/s"),
+        ({"joint_pos": at(robot.NOMINAL_STANCE, 3, 1.0)}, "joints: FL_hip is at 1.000 rad; its range is -0.863"),
+        ({"joint_pos": at(robot.NOMINAL_STANCE, 3, np.nan)}, "joints: FL_hip is at nan rad"),
+        ({"joint_vel": at(np.zeros(12), 2, 1.5)}, "joints: FR_calf moves at 1.50 rad/s"),
         ({"imu_quat": np.zeros(4)}, "attitude quaternion's length is 0.000"),
         ({"imu_acc": np.array([0.0, 0.0, 5.0])}, "accelerometer reports 5.00 m/s2"),
         ({"imu_quat": np.array([np.cos(0.4), np.sin(0.4), 0, 0])}, "tilt 46 deg"),

@@ -8,6 +8,7 @@ import socket
 import struct
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, cast
 
 import numpy as np
@@ -354,6 +355,7 @@ class Statue:
 
 
 End = tuple[Any, socket.socket, Any]
+Linked = tuple[Go1Link, socket.socket, tuple[str, int]]
 
 
 @pytest.fixture(scope="module")
@@ -381,16 +383,24 @@ def meet_command(end: End, packet: bytes, whole: bool) -> None:
         assert (np.abs(values) <= bound).all(), name  # NaN is not
 
 
-@pytest.fixture(scope="module")
-def looking() -> Iterator[End]:
+@contextmanager
+def linked(tick_s: float = 0.001) -> Iterator[Linked]:
     """A link, the socket of a robot to which it has spoken, and where to."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         other.settimeout(5.0)
-        link = Go1Link("127.0.0.1", other.getsockname()[1], 0.001)
-        link.receive()
-        yield link, other, other.recvfrom(1000)[1]
+        link = Go1Link("127.0.0.1", other.getsockname()[1], tick_s)
+        assert link.receive() == []
+        data, address = other.recvfrom(1000)
+        assert data == wire.IDLE  # asks for nothing until there is a command
+        yield link, other, address
         link.close()
+
+
+@pytest.fixture(scope="module")
+def looking() -> Iterator[Linked]:
+    with linked() as end:
+        yield end
 
 
 def meet_state(end: End, packet: bytes, whole: bool) -> None:
@@ -463,26 +473,16 @@ def test_a_state_with_a_reading_that_cannot_be_is_refused_by_name(place: int, va
 
 
 @pytest.fixture
-def pair() -> Iterator[tuple[Go1Link, socket.socket, tuple[str, int]]]:
-    """A link and the socket of a robot to which it has spoken."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.bind(("127.0.0.1", 0))
-        other.settimeout(5.0)
-        link = Go1Link("127.0.0.1", other.getsockname()[1], 0.001)
-        assert link.receive() == []
-        data, address = other.recvfrom(1000)
-        assert data == wire.IDLE  # asks for nothing until there is a command
-        yield link, other, address
-        link.close()
+def pair() -> Iterator[Linked]:
+    with linked() as end:
+        yield end
 
 
 def sent(tick: int) -> bytes:
     return wire.pack_state(state(), tick, HEALTH, np.zeros(3))
 
 
-def test_a_link_leaves_out_what_is_old_doubled_or_damaged_and_counts_it(
-    pair: tuple[Go1Link, socket.socket, tuple[str, int]],
-) -> None:
+def test_a_link_leaves_out_what_is_old_doubled_or_damaged_and_counts_it(pair: Linked) -> None:
     link, other, address = pair
     for data in (GOOD[:-1], VENDOR_COMMAND, GOOD[:80] + b"\7" + GOOD[81:], b""):
         other.sendto(data, address)
@@ -502,9 +502,7 @@ def test_a_link_leaves_out_what_is_old_doubled_or_damaged_and_counts_it(
     assert link.traffic.foreign == 4
 
 
-def test_a_link_reports_when_a_state_arrived_not_when_it_was_read(
-    pair: tuple[Go1Link, socket.socket, tuple[str, int]],
-) -> None:
+def test_a_link_reports_when_a_state_arrived_not_when_it_was_read(pair: Linked) -> None:
     link, other, address = pair
     other.sendto(sent(2), address)
     time.sleep(0.05)
@@ -526,7 +524,7 @@ def test_a_robot_that_is_gone_is_no_error_of_the_link() -> None:
     link.close()
 
 
-def test_a_tick_wraps_around(pair: tuple[Go1Link, socket.socket, tuple[str, int]]) -> None:
+def test_a_tick_wraps_around(pair: Linked) -> None:
     link, other, address = pair
     for tick in (2**32 - 4, 0, 2**32 - 2, 2):
         other.sendto(sent(tick), address)
@@ -535,7 +533,7 @@ def test_a_tick_wraps_around(pair: tuple[Go1Link, socket.socket, tuple[str, int]
     assert link.traffic.late == 0
 
 
-def test_a_command_is_sent_again_between_two_cycles(pair: tuple[Go1Link, socket.socket, tuple[str, int]]) -> None:
+def test_a_command_is_sent_again_between_two_cycles(pair: Linked) -> None:
     link, other, _ = pair
     link.send(command())
     link.repeat()  # at once: it has just been sent
@@ -549,11 +547,7 @@ def test_a_command_is_sent_again_between_two_cycles(pair: tuple[Go1Link, socket.
 
 
 def test_without_the_ticks_unit_a_state_has_no_clock() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.bind(("127.0.0.1", 0))
-        link = Go1Link("127.0.0.1", other.getsockname()[1])
-        link.receive()
-        _, address = other.recvfrom(1000)
+    with linked(math.nan) as (link, other, address):
         for tick in (2, 4, 3):
             other.sendto(sent(tick), address)
         assert [math.isnan(one.clock) for one in link.receive()] == [True, True]
@@ -564,7 +558,6 @@ def test_without_the_ticks_unit_a_state_has_no_clock() -> None:
             other.sendto(sent(tick), address)
         assert [round(1e3 * one.clock) for one in link.receive()] == [6, 12, 10, 14]
         assert (link.traffic.overtaken, link.traffic.late, link.traffic.lost) == (1, 1, 1)
-        link.close()
 
 
 # ---------------------------------------------------------------------- the simulated robot's side

@@ -192,22 +192,6 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(path: Path, monkeyp
     assert os.listdir(path.parent) == [path.name]
 
 
-def test_the_old_file_stands_until_the_new_one_is_whole(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    rec.write(path, arm())
-    calls = []
-    write_table = pq.write_table
-
-    def watching(table: pa.Table, where: Path, **options: Any) -> None:
-        write_table(table, where, **options)
-        calls.append("torque_enable" in rec.read(path).channels)
-
-    monkeypatch.setattr(pq, "write_table", watching)
-    rec.write(path, arm(torque_enable=np.ones(50, bool)))
-    assert calls == [False]
-    assert "torque_enable" in rec.read(path).channels
-    assert os.listdir(path.parent) == [path.name]
-
-
 # ---------------------------------------------------------------------- damaged files
 
 
@@ -330,11 +314,6 @@ def test_an_extension_column_is_refused_whether_pyarrow_knows_its_type_or_not(pa
     finally:
         pa.unregister_extension_type("go1exp.test.foreign")
     refused(path, "q_elbow: is of an extension type")
-
-
-def test_pickled_objects_are_refused_unread(path: Path) -> None:
-    bombs = pa.array([pickle.dumps(print)] * 50, pa.binary())
-    refused(plant(path, {**arm().channels, "q_elbow": bombs}), "q_elbow: is stored as byte_array")
 
 
 def test_nothing_here_can_unpickle() -> None:
