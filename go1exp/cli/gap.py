@@ -140,9 +140,9 @@ def _task(container: dict[str, Any]) -> int:
 
 def _next(settings: GapVerb) -> str:
     """Return the call of ``gap next`` on the answer, with the names that were given."""
-    from go1exp.cli.hydra_main import job
+    from go1exp.cli.hydra_main import overrides
 
-    chosen = next((o.partition("=")[2] for o in job().overrides if o.startswith("model=")), "go1")
+    chosen = next((o.partition("=")[2] for o in overrides() if o.startswith("model=")), "go1")
     logs = settings.logs if isinstance(settings.logs, str) else f"[{','.join(settings.logs)}]"
     given = {"logs": logs, "model": stored_choices("model").get(chosen.strip("'\""), chosen), "out": settings.out}
     return command("gap", "next", settings=given)

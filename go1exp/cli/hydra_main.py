@@ -87,6 +87,11 @@ def output_folder() -> Path:
     return Path(HydraConfig.get().runtime.output_dir)
 
 
+def overrides() -> list[str]:
+    """Return what the command line of the running job changes; nothing outside of a job."""
+    return list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else []
+
+
 def job() -> Job:
     """Return the job that is running."""
     about = HydraConfig.get()
@@ -95,7 +100,7 @@ def job() -> Job:
         output_folder(),
         multirun,
         about.job.num if multirun else 0,
-        list(about.overrides.task),
+        overrides(),
         list(about.overrides.hydra),
         about.runtime.choices.get("study") if about.sweeper.get("params") else None,
         plain(about.launcher),
