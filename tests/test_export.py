@@ -620,7 +620,7 @@ def test_export_writes_a_bundle_and_check_says_what_is_in_it(
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err.startswith("go1exp export check: bad.zip: config.json: damaged (")
-    assert verb(monkeypatch, "export", "check", "nowhere.zip") == 1
+    assert verb(monkeypatch, "export", "check", "nowhere.zip") == 2
     assert capsys.readouterr().err == "go1exp export check: No such file or directory: nowhere.zip\n"
 
 
@@ -638,7 +638,7 @@ def test_a_run_without_a_checkpoint_is_refused_and_leaves_nothing(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "config.yaml").write_bytes((run / "config.yaml").read_bytes())
-    assert verb(monkeypatch, "export", f"run={tmp_path}") == 1
+    assert verb(monkeypatch, "export", f"run={tmp_path}") == 2
     assert "no checkpoint to load" in capsys.readouterr().err
     assert [p.name for p in tmp_path.iterdir()] == ["config.yaml"]
 
