@@ -46,14 +46,11 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
 
 
 def made(folder: Path, episode: str, rows: int, kp: float = 20.0) -> Path:
-    """A recording of a hung Go1 at 500 Hz."""
+    """A recording of a suspended Go1 at 500 Hz."""
     about = meta(kp=(kp,) * len(JOINTS), kd=(0.5,) * len(JOINTS), episode=episode)
     t = np.arange(rows) / 500.0
-    wave = {
-        f"{quantity}_{joint}": 0.1 * np.sin(9.0 * t)
-        for quantity in ("q", "qd", "q_target", "tau_est")
-        for joint in JOINTS
-    }
+    phases = {"q": 0.0, "qd": 1.6, "q_target": 0.4, "tau_est": 0.9}  # rad: a column may not repeat another
+    wave = {f"{name}_{joint}": 0.1 * np.sin(9.0 * t + phase) for name, phase in phases.items() for joint in JOINTS}
     folder.mkdir(parents=True, exist_ok=True)
     recording.write(folder / f"{episode}.parquet", Recording(about, {"t": t, **wave}))
     return folder

@@ -12,7 +12,7 @@ from typing import Any
 
 _HOME = {
     "explain": "stages.explain",
-    "check": "stages.check",
+    "check": "stages.explain",
     "apply": "stages",
     "compare": "comparison",
     "Comparison": "comparison",
