@@ -104,14 +104,11 @@ def test_a_slipping_foot_and_a_blow_are_seen(make_core: Callable[..., Go1Core], 
     assert figures["contact/largest_force"] > 1e5
 
 
-def test_a_checkpoint_of_before_is_refused_in_a_line(
-    make_core: Callable[..., Go1Core], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_checkpoint_of_before_is_refused_in_a_line(make_core: Callable[..., Go1Core]) -> None:
     core = make_core(num_envs=1)
     state = core.state_dict()
     del state["gait_log"]
-    monkeypatch.setattr(checkpoint, "_core", lambda ppo: core)
-    learner: Any = SimpleNamespace(group=Group())
+    learner: Any = SimpleNamespace(group=Group(), core=core)
     with pytest.raises(DamagedCheckpoint, match="of another version of go1exp: it has no 'gait_log'"):
         checkpoint.restore(learner, {"env": state})
 

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from go1exp.base.tensors.rotation import rotate_inverse
 from go1exp.evaluate.controller.types import TrunkVelocity
 from go1exp.mdp.kinematics import KinematicState
 from go1exp.mdp.measures.trace import Trace
 from go1exp.sim.terrain import TerrainConfig
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Array = NDArray[np.float64]
 

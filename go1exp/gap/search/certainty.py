@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from go1exp.config.schema.registry import members
 from go1exp.gap.replay.rows import Key, Probe, Theta
 from go1exp.gap.score.likelihood import excess, removed
 from go1exp.gap.score.linear import Layout, Table, table, unbiased_grams
@@ -129,15 +130,11 @@ def on_bound(search: Search, effect: str, theta: Theta, joints: Sequence[str]) -
     return ""
 
 
-GAINS = ("kd_scale", "kp_scale", "strength")
-"""Effects of one law: the actuator's strength multiplies both gains."""
-
-
 def exact_aliases(search: Search, effect: str, joints: Sequence[str]) -> tuple[str, ...]:
     """Return effects whose influence on these data is that of a term, up to a factor, at all joints where it is.
 
-    By the Jacobian of what may move: columns that are parallel. Strength acts as both gains together, so each of the
-    three is one with the two others where a model guesses its gains.
+    By the Jacobian of what may move: columns that are parallel. Of the effects that act as a change of the gains each is
+    also held against all others together, where a model guesses its gains.
     """
     state, linear = search.state, search.state.table
     layout = Layout.from_probes(state.machine, linear.probes)
@@ -146,10 +143,9 @@ def exact_aliases(search: Search, effect: str, joints: Sequence[str]) -> tuple[s
     everyone = state.scorer.windows.joints
     effects = np.array([linear.probes[k].key[0] for k in layout.probe])
     at = np.isin(layout.joint, [-1, *(everyone.index(j) for j in joints)])
-    guessed = (
-        set(GAINS) - {effect} if effect in GAINS and getattr(state.machine, "guessed_gains", False) else set[str]()
-    )
-    rivals = [{name} for name in dict.fromkeys(effects) if name != effect] + ([guessed] if guessed else [])
+    rivals = [{name} for name in dict.fromkeys(effects) if name != effect]
+    if getattr(state.machine, "guessed_gains", False) and tolerances.identification(effect).of_gains:
+        rivals.append({name for name in members("effect") if tolerances.identification(name).of_gains} - {effect})
     columns = np.flatnonzero((effects == effect) & at)
 
     def acts_alike(names: set[str]) -> bool:

@@ -70,6 +70,8 @@ class Identification:
         common: its parameters have one value for all joints at which it is. For effects that few joints ever show.
         weighs_on_legs: one such error, equal at all joints, moves the legs of a standing robot as a change of weight
             does; an effect of the trunk must explain recordings better than it.
+        of_gains: it acts as a change of the controller's gains; where a model guesses those, no effect of this kind is
+            identifiable against the others together.
         uniform: one fault may give all joints the same value of it (a low battery, a wrong pose at calibration). It is
             tried as the one cause of all model errors of a standing robot, with one value.
         levels: changes from null, by parameter, in its unit, at which it is probed; each may become the start of a fit.
@@ -95,6 +97,7 @@ class Identification:
     needs_stand: bool = False
     common: bool = False
     weighs_on_legs: bool = False
+    of_gains: bool = False
     uniform: bool = False
     levels: tuple[Mapping[str, float], ...] = ()
     limits_torque: str = ""

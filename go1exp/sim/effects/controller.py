@@ -118,7 +118,12 @@ class KdScale(Effect):
     title = "a change of the velocity gain"
     params = (Param("scale", "-", 0.0, 5.0, 1.0, 0.15, "joint", "real gain over configured gain"),)
     identification = Identification(
-        nominal=True, rank=1, excitation="torque_off", confounded=("viscous",), separated_by=TWO_KD
+        nominal=True,
+        rank=1,
+        of_gains=True,
+        excitation="torque_off",
+        confounded=("viscous",),
+        separated_by=TWO_KD,
     )
 
     def on_gains(self, kp: Tensor, kd: Tensor) -> tuple[Tensor, Tensor]:
@@ -140,6 +145,7 @@ class KpScale(Effect):
         nominal=True,
         rank=0,
         weighs_on_legs=True,
+        of_gains=True,
         uniform=True,
         confounded=("armature", "link_mass", "strength"),
         separated_by=TWO_GAIN_SETS,

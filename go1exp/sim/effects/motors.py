@@ -31,6 +31,7 @@ class Strength(Effect):
         nominal=True,
         rank=2,
         weighs_on_legs=True,
+        of_gains=True,
         uniform=True,
         confounded=("armature", "kp_scale", "link_mass"),
         separated_by=TWO_GAIN_SETS,
