@@ -133,8 +133,8 @@ def on_bound(search: Search, effect: str, theta: Theta, joints: Sequence[str]) -
 def exact_aliases(search: Search, effect: str, joints: Sequence[str]) -> tuple[str, ...]:
     """Return effects whose influence on these data is that of a term, up to a factor, at all joints where it is.
 
-    By the Jacobian of what may move: columns that are parallel. Of the effects that act as a change of the gains each is
-    also held against all others together, where a model guesses its gains.
+    By the Jacobian of what may move: columns that are parallel. Where a model guesses its gains, each effect that acts
+    as a change of the gains is compared with all others of this kind together, too.
     """
     state, linear = search.state, search.state.table
     layout = Layout.from_probes(state.machine, linear.probes)
