@@ -230,7 +230,6 @@ def _list(container: dict[str, Any]) -> None:
 
 
 def _print_group(group: str, choices: list[tuple[str, str]], what: str) -> None:
-
     terms = members(group)
     print(group)
     if what != "terms":

@@ -28,7 +28,7 @@ from go1exp.gap.result import (
 from go1exp.gap.robots.go1 import GO1
 from go1exp.gap.score.likelihood import removed
 from go1exp.gap.search import thresholds, tolerances
-from go1exp.gap.search.candidates import deviation
+from go1exp.gap.search.candidates import at_bounds, deviation, on_bound
 from go1exp.gap.search.clocks import OF_CLOCK, span
 from go1exp.gap.search.screen import free_shapes
 from go1exp.gap.search.state import Search
@@ -329,12 +329,11 @@ def at_range_ends(answer: Answer, search: Search) -> list[str]:
     """Return which fitted parameters lie at the end of the range that is searched, with joints and value."""
     everyone, known, lines = search.state.scorer.windows.joints, search.state.tolerances, []
     for key in sorted(key for key in answer.theta if math.isfinite(known.param(key).tolerance)):
-        p, values = known.param(key), np.ravel(answer.theta[key])
-        for bound in {p.low, p.high} - {p.null}:
-            near = np.flatnonzero(np.abs(values - bound) <= thresholds.AT_BOUND * p.tolerance)
-            if len(near):
-                at = f" at {where([everyone[k] for k in near], everyone)}" if len(values) == len(everyone) else ""
-                lines.append(f"{key[0]} ({p.name}){at} lies on its bound, {bound:g} {p.unit.strip('-')}".rstrip())
+        for bound, near in at_bounds(key, answer.theta, known).items():
+            if near.any():
+                whole = len(near) != len(everyone)
+                at = "" if whole else where([j for j, on in zip(everyone, near, strict=True) if on], everyone)
+                lines.append(f"{key[0]}: {on_bound(key, bound, at, known)}")
     return lines
 
 

@@ -38,18 +38,25 @@ def beyond(effect: str, theta: Theta, joints: Sequence[str], tolerances: Toleran
     return outside
 
 
-def at_bound(key: Key, theta: Theta, tolerances: Tolerances) -> np.ndarray:
-    """Return which values of a parameter (J,) or (1,) leave their tolerance and lie on a bound of the parameter."""
+def at_bounds(key: Key, theta: Theta, tolerances: Tolerances) -> dict[float, np.ndarray]:
+    """Return by bound of a parameter which values (J,) or (1,) leave their tolerance and lie on that bound."""
     p = tolerances.param(key)
     values = np.ravel(theta.get(key, np.array([p.null])))
-    near = [np.abs(values - bound) <= thresholds.AT_BOUND * p.tolerance for bound in (p.low, p.high)]
-    return np.asarray((near[0] | near[1]) & (np.abs(values - p.null) > p.tolerance))
+    beyond = np.abs(values - p.null) > p.tolerance
+    return {b: beyond & (np.abs(values - b) <= thresholds.AT_BOUND * p.tolerance) for b in (p.low, p.high)}
+
+
+def on_bound(key: Key, bound: float, at: str, tolerances: Tolerances) -> str:
+    """Say that a parameter lies on its bound ``at`` these joints, a list in words; empty for one of the whole robot."""
+    p = tolerances.param(key)
+    unit = "" if p.unit == "-" else f" {p.unit}"
+    return f"{p.name}{f' at {at}' if at else ''} lies on its bound, {bound:g}{unit}"
 
 
 def bounded(effect: str, theta: Theta, joints: Sequence[str], tolerances: Tolerances) -> np.ndarray:
     """Return at which joints (J,) a value of an effect lies on its bound, beyond its tolerance."""
-    per_key = [at_bound(key, theta, tolerances) for key in sizes(effect)]
-    return np.any([np.broadcast_to(one, len(joints)) for one in per_key], axis=0)
+    each = [at for key in sizes(effect) for at in at_bounds(key, theta, tolerances).values()]
+    return np.any([np.broadcast_to(at, len(joints)) for at in each], axis=0)
 
 
 def count(effect: str, theta: Theta, machine: Machine) -> int:

@@ -17,7 +17,7 @@ from go1exp.gap.replay.rows import Key, Probe, Theta
 from go1exp.gap.score.likelihood import excess, removed
 from go1exp.gap.score.linear import Layout, Table, table, unbiased_grams
 from go1exp.gap.search import significance, thresholds, tolerances
-from go1exp.gap.search.candidates import at_bound
+from go1exp.gap.search.candidates import at_bounds, on_bound
 from go1exp.gap.search.fit import descend
 from go1exp.gap.search.state import LastCheck, Search, State
 from go1exp.sim.effects.tolerances import sizes
@@ -113,20 +113,18 @@ def semidefinite(matrix: np.ndarray) -> np.ndarray:
     return np.asarray(positive * scale[:, None] * scale)
 
 
-def on_bound(search: Search, effect: str, theta: Theta, joints: Sequence[str]) -> str:
+def first_on_bound(search: Search, effect: str, theta: Theta, joints: Sequence[str]) -> str:
     """Return which value of a term lies on the bound of its parameter, in words; empty if none does."""
-    everyone = search.state.scorer.windows.joints
+    everyone, known = search.state.scorer.windows.joints, search.state.tolerances
     for key in sizes(effect):
-        p = search.state.tolerances.param(key)
-        of_joint = p.per == "joint"
-        for k in np.flatnonzero(np.broadcast_to(at_bound(key, theta, search.state.tolerances), len(everyone))):
-            if of_joint and everyone[k] not in joints:
+        for bound, at in at_bounds(key, theta, known).items():
+            if known.param(key).per != "joint":
+                if at.any():
+                    return on_bound(key, bound, "", known)
                 continue
-            value = np.ravel(theta[key])[k if theta[key].size > 1 else 0]
-            nearest = min((p.low, p.high), key=lambda bound: abs(value - bound))
-            unit = "" if p.unit == "-" else f" {p.unit}"
-            at = f" at {everyone[k]}" if of_joint else ""
-            return f"{p.name}{at} lies on its bound, {nearest:g}{unit}"
+            for joint in np.array(everyone)[np.broadcast_to(at, len(everyone))]:
+                if joint in joints:
+                    return on_bound(key, bound, joint, known)
     return ""
 
 
@@ -182,7 +180,7 @@ def doubt(search: Search, effect: str, theta: Theta, joints: Sequence[str], adeq
         return f"it is named again in {stable:.0%} of the resamples only"
     if not joints and any(search.state.tolerances.param(key).per == "joint" for key in sizes(effect)):
         return "it leaves its tolerance at no joint beyond doubt"
-    if bound := on_bound(search, effect, theta, joints):
+    if bound := first_on_bound(search, effect, theta, joints):
         return bound
     if len(joints) == 1 and search.marginal and search.first - excess(search.select_chi2) < search.settings.material:
         return "the tolerances do nearly as well, and at one joint many effects act alike"
