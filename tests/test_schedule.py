@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -190,6 +191,32 @@ def test_a_metric_starts_a_ramp_when_its_mean_reaches_the_threshold() -> None:
         built(ramp(f"{WEIGHT}, over: 100, {when}"))[1].advance(50, {"gait/duty_mean": 0.5})
 
 
+def test_a_ramp_may_wait_for_two_metrics_at_once() -> None:
+    also = "also: {measure: tracking/rmse_x, below: 0.5, iterations: 1}"
+    _, schedule = built(ramp(f"{WEIGHT}, over: 0, when: {{measure: rollout/return, above: 1, iterations: 2, {also}}}"))
+    seen = []
+    for steps, (value, error) in enumerate(((2, 0.4), (2, 0.6), (0, 0.4), (2, math.nan), (2, 0.4), (0, 0.9))):
+        schedule.advance(steps, {"rollout/return": value, "tracking/rmse_x": error})
+        seen.append(schedule.metrics()["schedule/x"])
+    assert seen == [1.0, 1.0, 3.0, 3.0, 3.0, 3.0]  # the mean of 2 and 0 is 1
+    (said,) = problems(
+        ramp(f"{WEIGHT}, over: 0, when: {{measure: rollout/return, above: 1, also: {{measure: rmse, below: 1}}}}")
+    )
+    assert said.startswith("schedule.x.when.also.measure: unknown metric 'rmse'")
+
+
+@pytest.mark.parametrize(
+    ("rows", "left"), [(("gait",), ("linear_velocity_error",)), (("gait", "linear_velocity_error"), ())]
+)
+def test_a_ramp_does_not_wait_for_a_reward_that_was_taken_away(rows: tuple[str, ...], left: tuple[str, ...]) -> None:
+    config = parse_train(compose("train", [f"reward.{row}.weight=0" for row in rows]))
+    preflight.check(config)
+    smooth = config.schedule["smooth"]
+    assert tuple(t.measure for t in (smooth.when.all() if smooth.when else ())) == tuple(
+        f"reward/{row}" for row in left
+    )
+
+
 def test_a_run_that_was_stopped_continues_its_schedule_to_the_bit(tmp_path: Path) -> None:
     settings = [
         *(*FLAT, "actuator=delay", "+reward.touchdown_speed={weight: 0.0}"),
@@ -198,7 +225,7 @@ def test_a_run_that_was_stopped_continues_its_schedule_to_the_bit(tmp_path: Path
         ramp("set: actuator.command, from: [0.0, 0.0], to: [0.0, 0.02], start: 0, over: 384", "late"),
         ramp("set: contact.time_constant, from: 0.02, to: 0.005, start: 64, over: 256", "stiff"),
         ramp("set: reward.gait.weight, from: 1, to: 10, over: 128, when: {measure: task/fall_share, above: 0.0, "
-             "iterations: 3}", "when"),
+             "iterations: 3, also: {measure: rollout/length, above: 0.0, iterations: 2}}", "when"),
     ]  # fmt: skip
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     train(whole, [*settings, SIX])

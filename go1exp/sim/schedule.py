@@ -15,7 +15,7 @@ which the policy is evaluated.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
@@ -54,7 +54,22 @@ def parse(settings: Any, parts: Mapping[str, Any]) -> tuple[dict[str, Ramp], lis
             problems.append(f"schedule.{key}.set = {ramp.path!r}: is set by schedule.{setters[ramp.path]} too")
         setters[ramp.path] = key
         problems += _target_problems(f"schedule.{key}", ramp, parts)
-    return {key: ramp for key, ramp in ramps.items() if not _left_out(ramp, parts)}, problems
+    silent = silent_rows(parts["reward"], ramps.values())
+    return {k: _waiting(ramp, silent) for k, ramp in ramps.items() if not _left_out(ramp, parts)}, problems
+
+
+def silent_rows(reward: Iterable[Term], ramps: Iterable[Ramp]) -> set[str]:
+    """Return the metrics of rewards of weight 0, which are not computed, unless a ramp gives them a weight."""
+    paths = {ramp.path for ramp in ramps}
+    return {f"reward/{t.key}" for t in reward if not t.slots[WEIGHT] and f"reward.{t.key}.{WEIGHT}" not in paths}
+
+
+def _waiting(ramp: Ramp, silent: set[str]) -> Ramp:
+    """Return the ramp without conditions on rewards that an ablation has taken away."""
+    when = None
+    for trigger in reversed(ramp.when.all() if ramp.when else ()):
+        when = when if trigger.measure in silent else dataclasses.replace(trigger, also=when)
+    return dataclasses.replace(ramp, when=when)
 
 
 def _left_out(ramp: Ramp, parts: Mapping[str, Any]) -> bool:

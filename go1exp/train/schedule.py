@@ -14,7 +14,7 @@ from go1exp.config.schema.registry import ConfigError, unknown_name
 from go1exp.config.schema.training import EVALUATED, Ramp, Value
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.metrics import GaitLog, TaskLog
-from go1exp.sim.schedule import WEIGHT
+from go1exp.sim.schedule import silent_rows
 from go1exp.sim.task import TrainConfig
 
 PREFIX = "schedule/"
@@ -46,8 +46,8 @@ class Schedule:
         """
         self._per_iteration = per_iteration
         self._ramps, self._core = dict(ramps or {}), core
-        self._triggers = {key: ramp.when for key, ramp in self._ramps.items() if ramp.when}
-        self._recent = {key: deque[float](maxlen=trigger.iterations) for key, trigger in self._triggers.items()}
+        self._triggers = {key: ramp.when.all() for key, ramp in self._ramps.items() if ramp.when}
+        self._recent = {key: [deque[float](maxlen=t.iterations) for t in of] for key, of in self._triggers.items()}
         self._started: dict[str, int | None] = dict.fromkeys(self._triggers)
         self._values: dict[str, Value] = {}
         self._apply(0)
@@ -55,7 +55,7 @@ class Schedule:
     @property
     def measures(self) -> set[str]:
         """Metrics that start a ramp."""
-        return {trigger.measure for trigger in self._triggers.values()}
+        return {trigger.measure for of_ramp in self._triggers.values() for trigger in of_ramp}
 
     def advance(self, steps: int, metrics: Mapping[str, float]) -> None:
         """Put the values of the next iteration into force.
@@ -67,14 +67,20 @@ class Schedule:
         Raises:
             ConfigError: if a metric is missing.
         """
-        for key, trigger in self._triggers.items():
-            if trigger.measure not in metrics:
-                raise ConfigError([unknown_name(f"schedule.{key}.when.measure", trigger.measure, metrics, "metric")])
-            value, recent = float(metrics[trigger.measure]), self._recent[key]
-            if self._started[key] is not None or math.isnan(value):  # NaN: nothing was measured in this iteration
+        for key, triggers in self._triggers.items():
+            if self._started[key] is not None:
                 continue
-            recent.append(value)
-            if len(recent) == trigger.iterations and trigger.satisfied_by(sum(recent) / len(recent)):
+            satisfied = []
+            for trigger, recent in zip(triggers, self._recent[key], strict=True):
+                if trigger.measure not in metrics:
+                    path = f"schedule.{key}.when.measure"
+                    raise ConfigError([unknown_name(path, trigger.measure, metrics, "metric")])
+                value = float(metrics[trigger.measure])
+                if not math.isnan(value):  # NaN: nothing was measured in this iteration
+                    recent.append(value)
+                full = len(recent) == trigger.iterations and not math.isnan(value)
+                satisfied.append(full and trigger.satisfied_by(sum(recent) / len(recent)))
+            if all(satisfied):
                 self._started[key] = steps
         self._apply(steps)
 
@@ -100,12 +106,13 @@ class Schedule:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state that does not follow from the steps, as plain data; empty without a trigger."""
-        return {k: {"recent": list(self._recent[k]), "started": self._started[k]} for k in self._triggers}
+        return {k: {"recent": [list(r) for r in self._recent[k]], "started": self._started[k]} for k in self._triggers}
 
     def load_state_dict(self, state: Mapping[str, Any], steps: int) -> None:
         """Continue from ``state_dict`` after ``steps`` of all robots together."""
         for key, of_key in state.items():
-            self._recent[key] = deque(of_key["recent"], maxlen=self._triggers[key].iterations)
+            for recent, kept in zip(self._recent[key], of_key["recent"], strict=True):
+                recent.extend(kept)
             self._started[key] = of_key["started"]
         self._apply(steps)
 
@@ -116,16 +123,19 @@ def check_measures(config: TrainConfig) -> None:
     Raises:
         ConfigError: naming it and the nearest ones.
     """
-    paths = {ramp.path for ramp in config.schedule.values()}
-    rewarded = [t for t in config.task.reward if t.slots[WEIGHT] or f"reward.{t.key}.{WEIGHT}" in paths]
     cpu = torch.device("cpu")
-    known = [f"reward/{t.key}" for t in rewarded]
+    silent = silent_rows(config.task.reward, config.schedule.values())
+    known = [name for t in config.task.reward if (name := f"reward/{t.key}") not in silent]
     known += [*GaitLog(1, 1.0, cpu).drain(), *TaskLog(1.0, cpu).drain(), "rollout/return", "rollout/length"]
     known += [f"train/{name}" for name in LEARNER]
     known += ["curriculum/terrain_level"] if config.task.terrain.kind != "flat" else []
     known += ["physics/overflow"] if isinstance(config.task.backend, WarpBackend) else []
-    wanted = {key: ramp.when.measure for key, ramp in config.schedule.items() if ramp.when}
-    strange = {f"schedule.{key}.when.measure": name for key, name in wanted.items() if name not in known}
+    wanted = {
+        f"schedule.{key}.when.{'also.' * depth}measure": trigger.measure
+        for key, ramp in config.schedule.items()
+        for depth, trigger in enumerate(ramp.when.all() if ramp.when else ())
+    }
+    strange = {path: name for path, name in wanted.items() if name not in known}
     if strange:
         raise ConfigError(
             [

@@ -218,12 +218,14 @@ class Trigger(Strict):
         below: the ramp starts when the metric's mean is at most this.
         above: or when it is at least this.
         iterations: iterations over which the mean is taken.
+        also: another metric that must be at its threshold at the same time.
     """
 
     measure: str
     below: float | None = None
     above: float | None = None
     iterations: Iterations = 5
+    also: Trigger | None = None
 
     def __post_init__(self) -> None:
         """Check that there is one threshold."""
@@ -233,6 +235,10 @@ class Trigger(Strict):
     def satisfied_by(self, mean: float) -> bool:
         """Return whether the ramp starts at this mean of the metric."""
         return mean <= self.below if self.below is not None else mean >= (self.above or 0.0)
+
+    def all(self) -> tuple[Trigger, ...]:
+        """Return this trigger and those that must be satisfied with it."""
+        return (self, *(self.also.all() if self.also else ()))
 
 
 @dataclass(frozen=True)
@@ -245,7 +251,7 @@ class Ramp(Strict):
         to: value after it; without it the configured one.
         start: time after which the ramp starts, in unit; 0 without when.
         over: time that the ramp takes, in unit; 0 is a jump.
-        when: start at a metric's threshold instead, {measure, below or above, iterations}.
+        when: start at a metric's threshold instead, {measure, below or above, iterations, also}.
         unit: steps of all robots together, or iterations, which suit small and large batches alike.
         optional: leave the ramp out of a task without this setting, such as a delay with actuator=pd, or
             where it is drawn for each robot.
