@@ -892,6 +892,23 @@ def test_rows_that_their_neighbours_rule_out_are_named_and_left_out() -> None:
     assert len(without(zeros, lost).t) == ROWS - 4
 
 
+@pytest.mark.parametrize(("rate", "spike"), [(100.0, 0.15), (500.0, 0.02)])
+def test_zeros_and_spikes_of_one_channel_are_found_and_sound_rows_beside_them_are_kept(
+    rate: float, spike: float
+) -> None:
+    noise, t = np.random.default_rng(3), np.arange(3000) / rate
+    q = 0.5 * np.sin(2 * np.pi * 0.7 * t) + 0.2 * np.sin(2 * np.pi * 2.3 * t) + 2e-4 * noise.standard_normal(len(t))
+    sound = Recording(made_meta(("knee", "hip"), robot="bench", rate_hz=rate), {"t": t, "q_knee": q, "q_hip": q + 1.0})
+    lost = noise.random(len(t)) < 0.01
+    assert not impossible(sound).rows.any()
+    found = impossible(with_(sound, q_knee=np.where(lost, 0.0, q)))
+    assert np.abs(q[lost & ~found.rows]).max(initial=0.0) < 0.01
+    assert (found.rows & ~lost).sum() <= 2
+    assert "are zeros between values far from zero" in found.findings[0].message
+    found = impossible(with_(sound, q_knee=np.where(lost, q + spike, q)))
+    assert (found.rows & lost).sum() >= 0.6 * lost.sum()
+
+
 def _written(r: Recording, wrong: str) -> dict[str, np.ndarray]:
     """Columns of the joint FR_hip as a faulty logger computes them."""
     q, target, qd = (r.channels[f"{kind}_FR_hip"] for kind in ("q", "q_target", "qd"))

@@ -17,6 +17,9 @@ from go1exp.robot import JOINTS, VELOCITY_LIMIT
 SHOWN = 5
 """Rows that a message lists."""
 
+ZEROS = "are zeros between values far from zero"
+"""What is wrong with rows that a logger filled."""
+
 
 @dataclass(frozen=True)
 class Impossible:
@@ -58,19 +61,22 @@ def _wrong(recording: Recording) -> Iterator[tuple[str, np.ndarray, str]]:
         if not set(columns) <= set(recording.channels):
             continue
         values = recording.block(*columns)
-        zeros = _zeros(values, at_ends=quantity == "q")
+        zeros = _zeros(t, values, at_ends=quantity == "q")
         if quantity == "qd":  # a coarse encoder at rest reads zero, too
             slope = np.gradient(recording.joint("q"), t, axis=0) if recording.has("q") else np.zeros_like(values)
             zeros &= np.any(np.abs(slope) > limits.TURNS, axis=1)
         elif quantity == "tau_est":  # of actuators that are off
             zeros &= False
         if zeros.any():
-            yield (columns[0] if len(columns) == 1 else quantity), zeros, "are zeros between values far from zero"
+            yield (columns[0] if len(columns) == 1 else quantity), zeros, ZEROS
+        lone = np.zeros(values.shape, dtype=bool)
         if quantity == "q":  # spikes first: one that is left by an ordinary step would part what follows from the rest
-            least = limits.REVERSED * float(np.median(np.diff(t)))
-            out = np.stack([_spikes(x, least) for x in values.T], axis=1) & ~zeros[:, None]
-            sound = ~zeros & ~out.any(axis=1)
+            lone = np.stack([_lone_zeros(x, ~zeros) for x in values.T], axis=1)
+            out = np.stack([_outliers(t, x, ~zeros & ~lost) for x, lost in zip(values.T, lone.T, strict=True)], axis=1)
+            sound = ~zeros & ~lone.any(axis=1) & ~out.any(axis=1)
         for k, name in enumerate(columns):
+            if lone[:, k].any():
+                yield name, lone[:, k], ZEROS
             if quantity == "q":
                 jumps = np.zeros(len(t), dtype=bool)
                 jumps[sound] = _jumps(t[sound], values[sound, k], _fastest(recording, k))
@@ -79,13 +85,14 @@ def _wrong(recording: Recording) -> Iterator[tuple[str, np.ndarray, str]]:
                     yield name, jumps, f"are apart from the others by jumps, at up to {speed:.3g} rad/s"
                 wrong = out[:, k]
             elif quantity == "qd" and recording.has("q"):
-                wrong = _spikes(values[:, k], limits.REVERSED) & ~zeros
+                wrong = _spikes(t, values[:, k], limits.REVERSED) | _alone(t, values[:, k])
                 slope = np.gradient(recording.joint("q")[:, k], t)
                 wrong &= np.abs(values[:, k] - slope) > 0.7 * _returned(values[:, k])
             else:
-                middle, span = np.median(values[:, k]), np.ptp(np.quantile(values[:, k], (0.005, 0.995)))
-                far = np.abs(values[:, k] - middle) > limits.SPANS * max(float(span), 1e-9)
-                wrong = far & _spikes(values[:, k], 0.0) & ~zeros
+                span = max(float(np.ptp(np.quantile(values[:, k], (0.005, 0.995)))), 1e-9)
+                far = np.abs(values[:, k] - np.median(values[:, k])) / span
+                wrong = (far > limits.SPANS) & _spikes(t, values[:, k], 0.0) | (far > 2.0) & _alone(t, values[:, k])
+            wrong = wrong & ~zeros & ~lone[:, k]
             if wrong.any():
                 yield name, wrong, "are spikes that the readings before and after rule out"
 
@@ -106,20 +113,70 @@ def _returned(x: np.ndarray) -> np.ndarray:
     return out
 
 
-def _spikes(x: np.ndarray, least: float) -> np.ndarray:
+def _outliers(t: np.ndarray, q: np.ndarray, sound: np.ndarray) -> np.ndarray:
+    """Return which ``sound`` angles (T,), rad, are spikes, also those that show only where others are left out."""
+    left, least = sound.copy(), limits.REVERSED * float(np.median(np.diff(t)))
+    while left.sum() > limits.ENOUGH:
+        x = q[left]
+        wrong = _spikes(t[left], x, least) | _alone(t[left], x)
+        if not wrong.any():
+            break
+        left[np.flatnonzero(left)[wrong]] = False
+    return sound & ~left
+
+
+def _spikes(t: np.ndarray, x: np.ndarray, least: float) -> np.ndarray:
     """Return samples (T,) bool that go out and back by more than ``least`` and the usual, as no smooth motion does."""
     out = _returned(x)
-    return (out > max(least, limits.UNUSUAL * float(np.quantile(out, 0.9)))) & (_off(x) > 0.5 * out)
+    return (out > max(least, limits.UNUSUAL * float(np.quantile(out, 0.9)))) & (_off(t, x) > 0.5 * out)
 
 
-def _off(x: np.ndarray) -> np.ndarray:
-    """Return how far each sample (T,) lies from the cubic through its four neighbours; 0 at the ends."""
-    off = np.zeros(len(x))
-    off[2:-2] = np.abs(x[2:-2] - (4.0 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) / 6.0)
-    return off
+def _alone(t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return samples (T,) bool that that are off alone: by more than usual, than their neighbours, than at a bend."""
+    off, steps = _off(t, x), np.abs(np.diff(x))
+    noise = max(float(np.quantile(off[off > 0.0], 0.9)) if off.any() else 0.0, _step(x) / np.sqrt(12.0))
+    rows = (_returned(x) > 0.0) & (off > max(limits.UNUSUAL * noise, float(np.quantile(steps, 0.95))))
+    rows[1:-1] &= off[1:-1] > 0.8 * np.maximum(steps[1:], steps[:-1])
+    rows[1:-1] &= off[1:-1] > 1.3 * np.maximum(off[2:], off[:-2])
+    return rows
 
 
-def _zeros(values: np.ndarray, at_ends: bool) -> np.ndarray:
+def _step(x: np.ndarray) -> float:
+    """Return the smallest change between two samples; 0 if nothing changes."""
+    steps = np.abs(np.diff(x))
+    return float(np.min(steps[steps > 1e-12], initial=np.inf)) if steps.max(initial=0.0) > 1e-12 else 0.0
+
+
+def _off(t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return how far each sample (T,) lies from the cubic through its four neighbours; 0 at the ends.
+
+    Where neighbours are missing the cubic is less exact, so there it counts for less.
+    """
+    at, near = t[2:-2], np.stack([t[:-4], t[1:-3], t[3:-1], t[4:]])
+    others = ([j for j in range(4) if j != k] for k in range(4))
+    weights = np.stack([np.prod((at - near[j]) / (near[k] - near[j]), axis=0) for k, j in enumerate(others)])
+    wide = np.prod(np.abs(near - at), axis=0) / (4.0 * float(np.median(np.diff(t))) ** 4)
+    cubic = np.sum(weights * np.stack([x[:-4], x[1:-3], x[3:-1], x[4:]]), axis=0)
+    return np.pad(np.abs(x[2:-2] - cubic) / np.maximum(wide, 1.0), 2)
+
+
+def _lone_zeros(x: np.ndarray, sound: np.ndarray) -> np.ndarray:
+    """Return which ``sound`` samples (T,) are exactly 0 between values far from it, more often than x changes its sign.
+
+    Of a course through zero few samples are exactly 0.
+    """
+    rows, y = np.zeros(len(x), dtype=bool), x[sound]
+    short = [(a, b) for a, b in signals.stretches(y == 0.0) if a > 0 and b < len(y) and b - a <= limits.LOST_ROWS]
+    lost = np.zeros(len(y), dtype=bool)
+    for a, b in short:
+        lost[a:b] = min(abs(y[a - 1]), abs(y[b])) > limits.LOST_STEPS * _step(y)
+    rest = np.sign(y[~lost])
+    if lost.sum() >= limits.LOST_ROWS and lost.sum() > 0.25 * np.count_nonzero(rest[1:] != rest[:-1]):
+        rows[np.flatnonzero(sound)[lost]] = True
+    return rows
+
+
+def _zeros(t: np.ndarray, values: np.ndarray, at_ends: bool) -> np.ndarray:
     """Return rows (T,) bool of ``values`` (T, J) that are exactly 0, entered and left by an unusual jump.
 
     At the ends of a recording one jump is enough for angles. Speeds and torques may begin at zero.
@@ -134,7 +191,7 @@ def _zeros(values: np.ndarray, at_ends: bool) -> np.ndarray:
         return rows
     usual = limits.ZERO_JUMP * np.quantile(moved[inner], 0.95, axis=0) + 1e-6
     if at_ends:  # a single row is known by less: what lies between its neighbours is not zero
-        off = np.stack([_off(x) for x in values.T], axis=1)
+        off = np.stack([_off(t, x) for x in values.T], axis=1)
         noise = np.array([np.quantile(x[x > 0.0], 0.9) if x.any() else 0.0 for x in off.T])
         rows |= zero & np.any(off > limits.UNUSUAL * noise + 1e-6, axis=1)
     runs = signals.stretches(zero)

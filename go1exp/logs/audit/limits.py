@@ -165,6 +165,8 @@ UNUSUAL = 10.0
 """Times the 90 % quantile of what a channel goes out and back within a sample; also for noise."""
 ZERO_JUMP = 8.0
 """Times the 95 % quantile of a channel's steps, by which rows of zeros must be entered and left."""
+LOST_ROWS, LOST_STEPS = 3, 20.0
+"""Longest run of zeros in one channel that is a few lost readings, and resolutions by which both neighbours are off."""
 SPANS = 5.0
 """Spans of 99 % of a channel by which a torque or a reading of the IMU must lie outside; impacts are spikes, too."""
 MOST_IMPOSSIBLE = 0.2
