@@ -24,6 +24,7 @@ from go1exp.gap.comparison import NotComparable, compare, prepare
 from go1exp.gap.data.prepare import MOST_WINDOWS, clock_of_speeds, noise_in_time, slope
 from go1exp.gap.data.windows import averaged
 from go1exp.gap.replay.rows import Theta
+from go1exp.gap.report.words import next_recordings
 from go1exp.gap.result import GapSettings
 from go1exp.gap.robots.description import ModelConfig, parse_model
 from go1exp.gap.robots.fixed_base import FixedBase, robot_of
@@ -367,6 +368,19 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only some of the nominal parameters may vary, so that a replay has ten variants and not forty."""
     few = ("strength", "coulomb", "viscous", "link_mass", "base_tilt")
     monkeypatch.setattr(tolerances, "nominal", lambda machine: few)
+
+
+@pytest.mark.usefixtures("few")
+def test_a_gap_that_nothing_explains_beside_impossible_rows_is_laid_to_the_log() -> None:
+    robot = machine("xl330_pendulum", tolerances={})
+    (log,) = swung(robot, {"coulomb": {"bound": 0.12}}, 0.8, (3.0,), 4.0)
+    lost = np.random.default_rng(0).random(len(log.t)) < 0.01
+    log.channels["q_pendulum"][lost] = 0.0
+    result = explain([log], robot, dataclasses.replace(QUICK, effects=("cogging",)))
+    assert (result.verdict, result.named) == ("bad log", ())
+    assert "rows of these logs cannot be right" in result.sentence
+    assert next_recordings(result) == []
+    assert any("q_pendulum" in line and "zeros between" in line for line in result.warnings)
 
 
 @pytest.mark.usefixtures("few")

@@ -132,7 +132,8 @@ def _task(container: dict[str, Any]) -> int:
     result = replace(result, provenance={**result.provenance, "next": _next(settings)})
     if older := files.remove_older(out):
         print(f"\nremoved, of the earlier answer in {out}: {', '.join(older)}")
-    print(f"\n{result.sentence}\n\nwritten to {files.save(result, out)}")
+    notes = result.warnings if settings.stage == "explain" else ()  # the report, too, has them
+    print("", *notes, f"{result.sentence}\n\nwritten to {files.save(result, out)}", sep="\n")
     if settings.stage == "all" and result.verdict != "bad log":
         _apply(result, recordings, robot, settings)
     return _report(result, out) if settings.stage == "all" else result.exit_code

@@ -32,6 +32,8 @@ Progress = Callable[[str, float], None]
 FEWEST_WINDOWS = 8  # windows below which nothing is tested
 FEWEST_RECORDINGS = 3  # recordings that must remain if others are left out
 
+DOUBTFUL = 1e-3  # share of impossible rows above which a gap that nothing explains is laid to the log
+
 FEWEST_STRETCHES = 8
 """Stretches of held-out windows below which no sign-flip test of two clocks comes to p < 0.01: 2 / 2^8."""
 
@@ -84,6 +86,12 @@ class Comparison:
         """(W,) numbers of all windows."""
         return np.arange(len(self.windows))
 
+    @property
+    def doubtful(self) -> bool:
+        """Whether so many rows were impossible that others like them may remain."""
+        rows = sum(len(r.t) for r in self.recordings)
+        return self.ready.impossible > DOUBTFUL * rows
+
     def floors(self) -> Floors:
         """Return what no model can get below."""
         noise = self.windows.by_quantity(self.windows.scale)
@@ -108,7 +116,9 @@ def prepare(recordings: Sequence[Recording], robot: Robot, settings: GapSettings
         NotComparable: if too many of them cannot.
     """
     robot = robot.suited(recordings, settings.phase)
+    rows = sum(len(r.t) for r in recordings)
     recordings, removed = _without_impossible_rows(recordings)
+    left_out = rows - sum(len(r.t) for r in recordings)
     reports = [audit(r) for r in recordings]
     clocks = clock_flaws(reports)
     flaws = [
@@ -127,7 +137,7 @@ def prepare(recordings: Sequence[Recording], robot: Robot, settings: GapSettings
         removed.append(f"tau_est: {copied[0].channel} {copied[0].message}")
     ready = robot.prepared([recordings[k] for k in good], kept, settings)
     omitted = (f"Left out: {line}." for line in (*removed, *lines))
-    return robot, Ready(ready.recordings, ready.settings, ready.ignored, (*omitted, *ready.warnings))
+    return robot, replace(ready, warnings=(*omitted, *ready.warnings), impossible=left_out)
 
 
 def _without_impossible_rows(recordings: Sequence[Recording]) -> tuple[list[Recording], list[str]]:

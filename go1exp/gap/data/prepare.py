@@ -40,12 +40,14 @@ class Ready:
         settings: with windows that suit the robot, as far apart as their number asks.
         ignored: quantities that are present and not compared.
         warnings: what was chosen, a sentence each.
+        impossible: rows that were left out since their neighbours rule them out.
     """
 
     recordings: tuple[Recording, ...]
     settings: GapSettings
     ignored: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    impossible: int = 0
 
 
 def clock_of_speeds(t: np.ndarray, q: np.ndarray, qd: np.ndarray) -> np.ndarray:

@@ -236,6 +236,8 @@ def next_recordings(result: GapResult) -> list[Next]:
     """Return the next recordings: first to distinguish alias effects, then to excite further effects."""
     known = members("excitation")
     recordings: list[Next] = []
+    if result.verdict == "bad log":
+        return recordings
     for sentence in result.advice:
         names = [name for name in known if re.search(rf"\b{re.escape(name)}\b", sentence)]
         settings = re.findall(r"\b((?:gains|hang)=\[\[[-\d.,\[\]]*\]\])", sentence)

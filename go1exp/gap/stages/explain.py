@@ -12,6 +12,7 @@ import numpy as np
 
 from go1exp import __version__
 from go1exp.base.tensors.threads import one_thread
+from go1exp.base.wording import counted
 from go1exp.gap.answer import Answer, can_stand, concluded, evidence, not_excited
 from go1exp.gap.comparison import FEWEST_WINDOWS, Comparison, NotComparable, Progress, compare, robot_from
 from go1exp.gap.data.prepare import fingerprint
@@ -107,8 +108,21 @@ def _explained(
         on_progress("where it is wrong", 0.93)
         about = provenance(comparison, search, recordings, settings)
         result = written(comparison, search, answer, about, warnings, start)
+    if result.verdict == "unexplained" and comparison.doubtful:
+        result = _laid_to_the_log(result, comparison.ready.impossible)
     on_progress("done", 1.0)
     return result
+
+
+def _laid_to_the_log(result: GapResult, rows: int) -> GapResult:
+    """Return a gap that nothing explains as the verdict that logs with impossible ``rows`` allow."""
+    error = f"error {1.0 + result.excess['box']:.3g} times the noise floor"
+    line = (
+        f"{counted(rows, 'row')} of these logs cannot be right and were left out. The rest does not agree with the "
+        f"model ({error}), and nothing in the library explains it: others like them may remain. "
+        "Record again without such rows (go1exp record audit lists them)."
+    )
+    return replace(result, verdict="bad log", sentence=line)
 
 
 def doubts(named: Sequence[NamedEffect], on_ground: bool) -> list[str]:
