@@ -79,11 +79,10 @@ def test_from_training_to_the_replayed_log(
     (kept,) = (tmp_path / "logs").glob("*.parquet")
     account = json.loads(kept.with_suffix(".json").read_text())
     assert account["ended"] == "walked to the end"
-    assert list(account["phases"]) == ["waiting", "standing_up", "walking", "lying_down", "damping"]
+    assert list(account["phases"]) == ["waiting", "standing_up", "handing_over", "walking", "lying_down", "damping"]
     log = recording.read(kept)
     height = log.block("base_pos_z_w")[:, 0]
-    assert height[0] < 0.1
-    assert height.max() > 0.22
+    assert height[0] > 0.22  # it has stood up with other gains
     assert height[-1] < 0.12
 
     capsys.readouterr()

@@ -40,7 +40,7 @@ from go1exp.deploy.runtime.commands import (
     split_keys,
     stretched,
 )
-from go1exp.deploy.runtime.controller import LYING, PHASES, Cycle
+from go1exp.deploy.runtime.controller import LYING, PHASES, STANCE_ERROR, Cycle
 from go1exp.deploy.runtime.estimate import BLIND_S, KalmanEstimator, settings
 from go1exp.deploy.runtime.job import Job, run_job
 from go1exp.deploy.runtime.launch import RefusedError, RobotError
@@ -220,7 +220,7 @@ def play(
     bundle: str, out: Path, spoil: Spoil = lambda state: state, *, job: dict[str, Any] | None = None, **plan: Any
 ) -> SimpleNamespace:
     """Walk; return status, what was said, the account, the recording, the cycles and the world."""
-    usual: dict[str, Any] = {"seconds": 1.0, "stand_up": 0.2, "lie_down": 0.0, "brake": 0.1}
+    usual: dict[str, Any] = {"seconds": 1.0, "stand_up": 0.2, "hand_over": 0.0, "lie_down": 0.0, "brake": 0.1}
     usual["command"] = CommandConfig((0.4, 0.0, 0.0))
     output: list[str] = []
     with lockstep(spoil) as world:
@@ -258,11 +258,10 @@ def test_a_walk_from_the_bundle_to_the_recording(bundle: str, tmp_path: Path) ->
     assert done.account["walked_s"] == pytest.approx(1.0)
     phases = [PHASES[int(k)] for k in done.cycles["phase"]]
     counts = [phases.count(name) for name in PHASES]
-    assert counts[:3] == [1, 10, 50]
-    assert counts[3] == 0
-    assert counts[4] in (6, 7)  # for 0.1 s, both ends included, if rounding lets them
+    assert counts[:5] == [1, 10, 0, 50, 0]
+    assert counts[5] in (6, 7)  # for 0.1 s, both ends included, if rounding lets them
     assert done.account["timing"]["missed"] == 0
-    assert list(done.account["phases"]) == [name for name in PHASES if name != "lying_down"]
+    assert list(done.account["phases"]) == [name for name in PHASES if name not in ("handing_over", "lying_down")]
 
     r = done.recording
     assert (r.meta.source, r.meta.tool, r.meta.excitation, r.meta.base) == (
@@ -273,7 +272,7 @@ def test_a_walk_from_the_bundle_to_the_recording(bundle: str, tmp_path: Path) ->
     assert "torques have steps of 1/256 N m" in r.meta.notes
     assert r.meta.contact == bundle_task(bundle, {}).contact == MUJOCO_CONTACT
     assert r.meta.rate_hz == pytest.approx(500.0)
-    assert len(r.t) == 600
+    assert len(r.t) == 500  # standing up had other gains
     np.testing.assert_allclose(np.diff(r.t), TICK, atol=1e-9)
     # What the log says was in force is what the robot had, tick by tick.
     had = {round(clock / TICK): target for clock, target, _ in done.world.targets}
@@ -354,12 +353,27 @@ def test_another_rate_is_the_policys(bundle: str, tmp_path: Path, rate: float) -
     assert len(np.unique(done.cycles["q_target"][walking], axis=0)) > 0.9 * walking.sum()
 
 
-def test_a_robot_gets_up_from_its_belly(bundle: str, tmp_path: Path) -> None:
-    done = play(bundle, tmp_path, stand_up=1.0, seconds=0.5, job={"sim": {"start": "lying"}, "truth": True})
+@pytest.mark.parametrize("start", ["lying", "crouched", "sitting"])
+def test_a_robot_stands_up_into_the_stance_and_is_handed_over_without_a_jump(
+    bundle: str, tmp_path: Path, start: str
+) -> None:
+    job = {"sim": {"start": start, "noise": 0.0}, "truth": True}
+    done = play(bundle, tmp_path, stand_up=1.0, hand_over=0.3, seconds=0.3, job=job)
     assert done.status == 0
-    height = done.recording.block("base_pos_z_w")[:, 0]
-    assert height[0] < 0.1
-    assert height[-1] > 0.22
+    rows = done.world.server.truth.rows()
+    assert rows[0, 1 + TRUTH.index("base_pos_z_w")] < 0.2
+    phase = np.array(PHASES)[done.cycles["phase"].astype(int)]
+    first = int(np.argmax(phase == "handing_over"))
+    assert np.abs(done.cycles["q"][first] - robot.NOMINAL_STANCE).max() <= STANCE_ERROR
+    np.testing.assert_allclose(done.cycles["q_target"][first], robot.NOMINAL_STANCE, atol=1e-6)
+    stood = done.account["stand_up"]
+    assert (stood["seconds"], stood["step"]) == (pytest.approx(1.0, abs=0.03), pytest.approx(0.1, abs=0.1))
+    assert any(line.startswith("stood up in 1.0 s, ") for line in done.output)
+    heights = done.recording.block("base_pos_z_w")[:, 0]  # under the gains of the recording alone
+    assert (heights > 0.22).all()
+    r = done.recording
+    torque = 35.0 * (r.joint("q_target") - r.joint("q")) - 0.6875 * r.joint("qd")
+    assert np.median(np.abs(torque - r.joint("tau_est"))) < 0.02
 
 
 # ---------------------------------------------------------------------- the end of a walk
@@ -382,7 +396,7 @@ def test_a_walk_ends_with_lying_down(bundle: str, tmp_path: Path) -> None:
     assert sinking.status == lying.status == 0
     assert lying.account["ended"] == sinking.account["ended"] == DONE
     assert lying.account["walked_s"] == pytest.approx(0.5)
-    assert list(lying.account["phases"]) == list(PHASES)
+    assert list(lying.account["phases"]) == [name for name in PHASES if name != "handing_over"]
     assert lying.account["phases"]["damping"] - lying.account["phases"]["lying_down"] == pytest.approx(2.0, abs=0.03)
     _, fast, after = ended(sinking)
     assert after[0] > 0.2  # it falls from where it stood

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import gc
 import math
+import re
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from types import SimpleNamespace
@@ -16,7 +17,7 @@ import pytest
 from go1exp import robot
 from go1exp.deploy.runtime import loop as loop_module
 from go1exp.deploy.runtime.bundle import Bundle
-from go1exp.deploy.runtime.controller import Controller, Cycle, Stages
+from go1exp.deploy.runtime.controller import STAND_KD, STAND_KP, Controller, Cycle, Stages
 from go1exp.deploy.runtime.loop import Deadlines, MonotonicClock, Timing, run
 from go1exp.deploy.runtime.metadata import Port
 from go1exp.deploy.runtime.safety import RULES, Safety, SafetyConfig, sdk_range, tilt_angle
@@ -305,11 +306,11 @@ def controller(
     **settings: Any,
 ) -> SimpleNamespace:
     link, policy, log = FakeLink(script), FakePolicy(), list[Cycle]()
-    ports = {"inputs": policy.inputs, "observation": ()}
+    ports = {"inputs": policy.inputs, "observation": (), "joints": robot.JOINTS}
     about = SimpleNamespace(kp=tuple(KP), kd=tuple(KD), nominal_stance=tuple(NOMINAL), policy_dt=0.04, **ports)
     bundle = cast(Bundle, SimpleNamespace(metadata=about, policy=policy))
     usual: dict[str, Any] = {"rate": 25.0, "on_cycle": log.append}
-    times = {"stand_up": 0.1, "lie_down": 0.0, "brake": 0.045}
+    times = {"stand_up": 0.1, "hand_over": 0.0, "lie_down": 0.0, "brake": 0.045}
     times |= {field.name: settings.pop(field.name) for field in dataclasses.fields(Stages) if field.name in settings}
     usual["stages"] = Stages(**times)
     made = Controller(bundle, link, commands, estimator or Velocity(), make_safety(), **{**usual, **settings})
@@ -321,21 +322,52 @@ def controller(
 
 
 def test_a_robot_stands_up_and_then_walks() -> None:
-    lying = at(NOMINAL, 1, 1.8)
+    lying = at(NOMINAL, 1, 1.1)
 
     def script(cycle: int) -> Sequence[LowState]:
-        return [low_state(0.01 * cycle, joint_pos=lying)] if cycle >= 3 else []
+        return [low_state(0.01 * cycle, joint_pos=lying if cycle < 13 else NOMINAL)] if cycle >= 3 else []
 
     made = controller(script)
     assert all(made.run_cycles(30))
     assert [c.phase for c in made.log] == ["waiting"] * 3 + ["standing_up"] * 10 + ["walking"] * 17
     assert [c.command is None for c in made.log] == [True] * 3 + [False] * 27  # nothing is sent to who says nothing
     thighs = [c.command.joint_target[1] for c in made.log[3:13]]
-    np.testing.assert_allclose(thighs, 1.8 + (NOMINAL[1] - 1.8) * np.arange(10) / 10, atol=1e-9)
-    assert all((c.kp == KP).all() and (c.kd == KD).all() and not c.damping for c in made.link.sent)
+    np.testing.assert_allclose(thighs, 1.1 + (NOMINAL[1] - 1.1) * np.arange(10) / 10, atol=1e-9)
+    assert [(*{*c.kp}, *{*c.kd}) for c in made.link.sent] == [(STAND_KP, STAND_KD)] * 10 + [(20.0, 0.5)] * 17
     np.testing.assert_allclose(made.link.sent[-1].joint_target[0], NOMINAL[0] + 0.03, atol=1e-6)
     actions = [readings["previous_action"][0, 0] for readings in made.policy.calls]
     np.testing.assert_allclose(actions, [0.0] + [0.3] * 16, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"joint_pos": at(NOMINAL, 8, NOMINAL[8] - 0.6)}, r"in 3\.1 s: RR_calf is -0\.60 rad off \(at most 0\.15\)"),
+        ({"imu_quat": leaning(0.5)}, r"in 3\.1 s: tilt 29 deg \(at most 20\)"),
+    ],
+)
+def test_a_stance_that_is_not_reached_is_a_fault_that_names_what_is_not(wrong: dict[str, Any], message: str) -> None:
+    made = controller(lambda cycle: [low_state(0.01 * cycle, **wrong)])
+    made.run_cycles(330)
+    assert "walking" not in {c.phase for c in made.log}
+    assert made.safety.fault is not None
+    assert made.safety.fault.name == "stand_up"
+    assert re.search(message, made.safety.fault.message)
+    assert made.link.sent[-1].damping
+
+
+def test_in_the_hand_over_torques_go_from_the_stance_to_the_policy_without_a_jump() -> None:
+    """Torque at a share s: (1 - s) of that of the stance, s of the policy's, which is commanded to stand."""
+    sagging = at(NOMINAL, 8, NOMINAL[8] - 0.1)
+    made = controller(lambda cycle: [low_state(0.01 * cycle, joint_pos=sagging)], hand_over=0.1)
+    made.run_cycles(35)
+    assert [c.phase for c in made.log] == ["standing_up"] * 10 + ["handing_over"] * 10 + ["walking"] * 15
+    for k, cycle in enumerate(made.log[10:20]):
+        assert cycle.command is not None
+        torque = cycle.command.kp * (cycle.command.joint_target - sagging)
+        np.testing.assert_allclose(torque, (STAND_KP + k / 10 * (20.0 - STAND_KP)) * (NOMINAL - sagging), atol=1e-5)
+        assert cycle.command.kd[0] == pytest.approx(STAND_KD + k / 10 * (0.5 - STAND_KD))
+        assert not cycle.velocity.any()
 
 
 def test_the_estimator_gets_every_state_once_and_the_policy_the_newest_estimate() -> None:
@@ -477,7 +509,7 @@ def test_times_of_a_walk_that_cannot_be_are_refused_together() -> None:
 
 
 def test_gains_that_nobody_knows_have_to_be_given() -> None:
-    ports = {"inputs": FakePolicy().inputs, "observation": ()}
+    ports = {"inputs": FakePolicy().inputs, "observation": (), "joints": robot.JOINTS}
     about = SimpleNamespace(kp=None, kd=None, nominal_stance=tuple(NOMINAL), policy_dt=0.02, **ports)
     bundle = cast(Bundle, SimpleNamespace(metadata=about, policy=FakePolicy()))
     arguments = (FakeLink(always), lambda t: np.zeros(3), Velocity(), make_safety())

@@ -195,7 +195,8 @@ def test_a_bundle_says_what_its_run_was(run: Path, good: Bundle) -> None:
     assert about.kp == (25.0, 30.0, 35.0) * 4
     assert about.kd == (0.7,) * 12
     assert about.action_scale == 0.3
-    assert (about.policy_dt, about.physics_dt) == (0.02, 0.002)
+    sim = good.config["sim"]
+    assert (about.policy_dt, about.physics_dt) == (sim["policy_dt"], sim["physics_dt"])
     assert about.command_ranges == {"lin_vel_x": (-2.0, 3.0), "lin_vel_y": (-1.5, 1.5), "ang_vel_z": (-1.5, 1.5)}
     assert about.torque_limit == (23.7, 23.7, 35.55) * 4
     assert about.trained.checkpoint == "000002.pt"
@@ -546,8 +547,16 @@ def test_the_runtime_does_on_the_traces_readings_what_the_environment_did(good: 
     commands = lambda t: trace["input.command"][len(sent)]  # noqa: E731
     estimator = SimpleNamespace(update=lambda state: None, ahead=lambda age: trace["input.base_lin_vel_b"][len(sent)])
     safety = Safety(robot.JOINTS, robot.JOINT_POS_LIMITS, np.array(good.metadata.torque_limit))
+    gains = {"kp": np.array(good.metadata.kp), "kd": np.array(good.metadata.kd)}
     runtime = Controller(
-        good, cast(Link, link), commands, estimator, safety, stages=Stages(stand_up=0.0), on_cycle=observed.append
+        good,
+        cast(Link, link),
+        commands,
+        estimator,
+        safety,
+        stages=Stages(stand_up=0.0),
+        on_cycle=observed.append,
+        **gains,
     )
     for state in states:
         assert runtime.cycle(state.t)

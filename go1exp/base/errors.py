@@ -34,7 +34,7 @@ DOES_NOT_HOLD, NOT_SEPARABLE = 15, 16
 
 FAULTS = (
     *("operator_stop", "stale_state", "not_finite", "attitude", "tilt", "joint_range", "torque", "power"),
-    *("no_state", "estimator", "command", "runtime"),
+    *("no_state", "estimator", "command", "runtime", "stand_up"),
 )
 """Faults that end a walk (``deploy/runtime/safety.py``), in the order of their statuses."""
 UNKNOWN_FAULT, FIRST_FAULT = 19, 20

@@ -50,7 +50,7 @@ WORDS = {
     "share": ("all", "kind", "none"),
     "target": ("tau_est", "joint_torque"),
     "device": ("auto", "cpu", "cuda"),
-    "start": ("standing", "lying", "suspended"),
+    "start": ("standing", "lying", "crouched", "sitting", "suspended"),
     "selection": ("max_t", "gain", "bic"),
     "correction": ("holm", "none"),
     "wandb": ("offline", "online"),

@@ -34,6 +34,7 @@ def three(text: str) -> tuple[float, ...]:
 
 TIMES = (
     ("stand_up", not_negative, "s from the first pose to the nominal stance"),
+    ("hand_over", not_negative, "s from the gains of standing up to the policy's"),
     ("lie_down", not_negative, "s for lying down at the end of a walk; 0: brake at once"),
     ("brake", not_negative, "s for which the motors brake at the end"),
     ("keep", positive, "newest seconds that the log holds"),
@@ -41,6 +42,9 @@ TIMES = (
     ("spin", not_negative, "s before each cycle for which the core is kept busy"),
 )
 """Settings of the plan in seconds: name, type and meaning."""
+
+
+STARTS = ("standing", "lying", "crouched", "sitting", "suspended")
 
 
 def arguments(given: Sequence[str]) -> argparse.Namespace:
@@ -64,7 +68,7 @@ def arguments(given: Sequence[str]) -> argparse.Namespace:
         parser.add_argument(f"--{name.replace('_', '-')}", type=kind, default=getattr(Plan, name), help=meaning)
     parser.add_argument("--out", default="runs/deploy", help="folder of the logs")
     sim = parser.add_argument_group("with --robot sim")
-    sim.add_argument("--start", choices=("standing", "lying", "suspended"), default="standing")
+    sim.add_argument("--start", choices=STARTS, default="standing")
     sim.add_argument("--noise", type=float, default=1.0, help="relative to the paper's Table II")
     sim.add_argument("--delay", type=float, default=0.0, help="of packets, each way, s")
     sim.add_argument("--jitter", type=float, default=0.0, help="largest additional delay of each packet, s")

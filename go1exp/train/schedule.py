@@ -47,7 +47,9 @@ class Schedule:
         self._per_iteration = per_iteration
         self._ramps, self._core = dict(ramps or {}), core
         self._triggers = {key: ramp.when.all() for key, ramp in self._ramps.items() if ramp.when}
-        self._recent = {key: [deque[float](maxlen=t.iterations) for t in of] for key, of in self._triggers.items()}
+        self._recent = {
+            key: [deque[float](maxlen=t.iterations) for t in triggers] for key, triggers in self._triggers.items()
+        }
         self._started: dict[str, int | None] = dict.fromkeys(self._triggers)
         self._values: dict[str, Value] = {}
         self._apply(0)

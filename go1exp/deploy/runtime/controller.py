@@ -11,13 +11,22 @@ import numpy as np
 
 from go1exp.deploy.runtime.bundle import Bundle
 from go1exp.deploy.runtime.policy import PolicyMemory
-from go1exp.deploy.runtime.safety import Safety
+from go1exp.deploy.runtime.safety import Safety, tilt_angle
 from go1exp.deploy.runtime.udp import PacketDelay
 from go1exp.robot.messages import Link, LowCmd, LowState
 
-PHASES = ("waiting", "standing_up", "walking", "lying_down", "damping")
-"""Before the first state; moving to the nominal stance; under the policy; lying down at an orderly end; braking until
-the end."""
+PHASES = ("waiting", "standing_up", "handing_over", "walking", "lying_down", "damping")
+"""Before the first state; moving to the nominal stance; from its gains to the policy's, which is commanded to stand;
+under the policy; lying down at an orderly end; braking until the end."""
+
+STAND_KP, STAND_KD = 80.0, 2.5
+"""Gains of standing up, N m/rad and N m s/rad (chosen: errors below 0.1 rad under the robot's weight)."""
+
+STANCE_ERROR, STANCE_TILT = 0.15, 0.35
+"""Largest difference of a joint from the nominal stance, and largest tilt, of a robot that stands, rad (chosen)."""
+
+STAND_PATIENCE = 3.0
+"""Time after ``Stages.stand_up`` within which the stance must be reached, s."""
 
 LYING = (0.0, 1.3, -2.65)
 """Hip, thigh and calf angle of every leg of a lying Go1, rad."""
@@ -33,6 +42,7 @@ class Stages:
 
     Attributes:
         stand_up: time from the first pose to the nominal stance, s.
+        hand_over: time from standing in the stance to the policy's own gains and targets, s.
         lie_down: time for lying down at an orderly end, s; 0: the motors brake at once.
         brake: time for which the motors brake at the end, s.
         patience: time to wait for the robot's first state, s.
@@ -42,14 +52,15 @@ class Stages:
     """
 
     stand_up: float = 2.0
+    hand_over: float = 0.5
     lie_down: float = 2.0
     brake: float = 2.0
     patience: float = 5.0
 
     def __post_init__(self) -> None:
         """Check the times."""
-        times = {"stand_up": self.stand_up, "lie_down": self.lie_down, "brake": self.brake}
-        problems = [f"{name} = {time}: must be at least 0" for name, time in times.items() if not time >= 0.0]
+        times = ("stand_up", "hand_over", "lie_down", "brake")
+        problems = [f"{k} = {getattr(self, k)}: must be at least 0" for k in times if not getattr(self, k) >= 0.0]
         if not self.patience > 0.0:
             problems.append(f"patience = {self.patience}: must be greater than 0")
         if problems:
@@ -146,7 +157,7 @@ class Controller:
             safety: has the robot's limits.
             rate: cycles per second, Hz; that of training if None.
             stages: their durations.
-            kp: (J,) N m/rad; those of the bundle if None.
+            kp: (J,) N m/rad, also for standing up; None: those of the bundle, after those of standing up.
             kd: (J,) N m s/rad.
             on_cycle: called after every cycle.
             mover: commands the robot in place of the policy.
@@ -161,7 +172,9 @@ class Controller:
         self._policy, self._link, self._commands = bundle.policy, link, commands
         self._estimator, self.safety, self._on_cycle = estimator, safety, on_cycle
         self._kp, self._kd = (np.asarray(values, dtype=float) for values in gains)
-        self._nominal = np.asarray(about.nominal_stance)
+        given, size = kp is not None, len(self._kp)
+        self._stand_gains = None if given else (np.full(size, STAND_KP), np.full(size, STAND_KD))
+        self._joints, self._nominal = about.joints, np.asarray(about.nominal_stance)
         self._stages = stages or Stages()
         self._lying = np.tile(LYING, len(self._nominal) // len(LYING))
         self._begin: float | None = None
@@ -258,15 +271,53 @@ class Controller:
         self._base = self._estimator.ahead(self._age)
         if self.phase == "waiting":
             self.phase, self._since, self._origin = "standing_up", now, state.joint_pos.copy()
-        if self.phase == "standing_up":
-            stand_up = self._stages.stand_up
-            share = (now - self._since) / stand_up if stand_up > 0 else 1.0
+        if self.phase == "standing_up" and (command := self._stand_up(state, now)):
+            return command
+        if self.phase == "handing_over":
+            share = _share(now - self._since, self._stages.hand_over)
             if share < 1.0:
-                return LowCmd(self._origin + share * (self._nominal - self._origin), self._kp, self._kd)
+                return self._blended(share, self._walk(state, now))
             self.phase, self._since = "walking", now
         if self.phase == "lying_down":
             return self._lie(state, now)
         return self._walk(state, now)
+
+    def _stand_up(self, state: LowState, now: float) -> LowCmd | None:
+        """Return the command towards the stance; None once it is reached. A fault names what is not."""
+        gains = self._stand_gains or (self._kp, self._kd)
+        share = _share(now - self._since, self._stages.stand_up)
+        if share < 1.0:
+            return LowCmd(self._origin + share * (self._nominal - self._origin), *gains)
+        missing = "" if self._stand_gains is None else self._missing(state)
+        if not missing:
+            self.phase, self._since = "walking" if self._stand_gains is None else "handing_over", now
+            return None
+        if now - self._since > self._stages.stand_up + STAND_PATIENCE:
+            self.safety.fail("stand_up", f"the stance is not reached in {now - self._since:.1f} s: {missing}", now)
+        return LowCmd(self._nominal, *gains)
+
+    def _missing(self, state: LowState) -> str:
+        """Return what of the stance is not reached; empty if all of it is."""
+        away = state.joint_pos - self._nominal
+        k, tilt = int(np.abs(away).argmax()), tilt_angle(state.imu_quat)
+        wrong = []
+        if not abs(away[k]) <= STANCE_ERROR:
+            torque = f"with {state.joint_torque[k]:+.1f} N m"
+            wrong.append(f"{self._joints[k]} is {away[k]:+.2f} rad off (at most {STANCE_ERROR:g}) {torque}")
+        if not tilt <= STANCE_TILT:
+            wrong.append(f"tilt {math.degrees(tilt):.0f} deg (at most {math.degrees(STANCE_TILT):.0f})")
+        return ", ".join(wrong)
+
+    def _blended(self, share: float, wanted: LowCmd | None) -> LowCmd | None:
+        """Return a command whose torques are a share of the wanted ones, the rest those of the stance."""
+        if wanted is None or self._stand_gains is None:
+            return wanted
+        (kp, kd), rest = self._stand_gains, 1.0 - share
+        stance_kp, policy_kp = rest * kp, share * wanted.kp
+        total_kp = stance_kp + policy_kp
+        target = (stance_kp * self._nominal + policy_kp * wanted.joint_target) / total_kp
+        fed = None if wanted.feedforward is None else share * wanted.feedforward
+        return LowCmd(target, total_kp, rest * kd + share * wanted.kd, feedforward=fed)
 
     def _lie(self, state: LowState, now: float) -> LowCmd | None:
         """Stand still under the policy if it walked, move to the nominal stance, lie down; None at the end."""
@@ -310,3 +361,8 @@ class Controller:
         outputs = self._memory(self._policy, self._readings)
         self._observation = outputs["observation"][0]
         return LowCmd(outputs["joint_target"][0].astype(float), self._kp, self._kd)
+
+
+def _share(passed: float, whole: float) -> float:
+    """Return which share of a stage has passed, also of one without length."""
+    return passed / whole if whole > 0 else 1.0

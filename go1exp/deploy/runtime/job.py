@@ -256,6 +256,7 @@ def _about(job: Job, bundle: Bundle) -> About:
         episode=_free(Path(job.out), time.strftime(f"{job.motion or 'walk'}_%Y-%m-%d_%H-%M-%S")),
         excitation=job.motion or "policy",
         suspended=job.motion is not None,
+        varied=job.mover is not None and job.motion is None,
         notes=f"ends where the motors begin to brake{ON_WIRE}{OTHER_MOVER if job.mover and not job.motion else ''}",
         trained=bundle.config,
     )

@@ -50,7 +50,7 @@ class SimulatedRobot(contextlib.AbstractContextManager["SimulatedRobot"]):
         port: where it listens.
         report: its report of the walk, after ``close``: datagrams, and how it kept real time.
         truth: the trunk's true motion by column, with ``clock``, after ``close``; empty for a suspended robot.
-        applied: the applied commands, after ``close``: rows of clock, s, whether one applied, and its targets, rad.
+        applied: the applied commands, after ``close``: rows of clock, s, and ``Robot.applied``.
     """
 
     def __init__(self, bundle: str, sim: Mapping[str, Any], other: Mapping[str, Any], keep: float = 120.0) -> None:

@@ -29,10 +29,14 @@ STATE = (
 )
 CYCLE = (
     *(("t", 1), ("phase", 1), ("number", 1), ("damping", 1), ("q_target", 12), ("command", 3), ("estimate", 3)),
-    *(("sent_at", 1), ("age", 1)),
+    *(("sent_at", 1), ("age", 1), ("q", 12)),
 )
 """Parts of a row: name and width. Times s; ``phase`` an index of ``PHASES``; ``number`` of the command sent, or 0;
-``sent_at`` and ``age`` as in ``Cycle``."""
+``sent_at`` and ``age`` as in ``Cycle``; ``q`` of the newest state."""
+
+
+RISING = [PHASES.index(name) for name in ("standing_up", "handing_over")]
+"""Phases whose gains are not those of walking, unless the robot is suspended."""
 
 
 class Ring:
@@ -80,13 +84,15 @@ class About:
 
     Attributes:
         metadata: of the bundle.
-        kp: (J,) N m/rad, in force while standing up and walking.
+        kp: (J,) N m/rad, in force while walking and in every row of the recording.
         kd: (J,) N m s/rad.
         simulated: not measured on hardware.
         newton: the feet's readings are in newtons; if not, they are left out of the recording.
         episode: the recording's name.
         excitation: name of the motion.
-        suspended: whether its trunk was held in the air; the mean attitude of the IMU is recorded then.
+        suspended: whether its trunk was held in the air; the mean attitude of the IMU is recorded then, and the stance
+            is approached with the same gains.
+        varied: whether the gains change all the time; rows of all gains are recorded then.
         notes: for the reader.
         trained: the configuration of the policy's run, with the contact of its feet.
     """
@@ -99,6 +105,7 @@ class About:
     episode: str
     excitation: str = "policy"
     suspended: bool = False
+    varied: bool = False
     notes: str = ""
     trained: Mapping[str, Any] = field(default_factory=dict)
 
@@ -141,21 +148,23 @@ class Log:
             row[2], row[3], row[4:16] = self._sent, cycle.command.damping, cycle.command.joint_target
         row[16:19], row[19:22] = cycle.velocity, cycle.base_lin_vel
         row[22], row[23] = cycle.sent_at, cycle.age
+        row[24:36] = np.nan if cycle.state is None else cycle.state.joint_pos
         self.phases.setdefault(cycle.phase, cycle.t)
 
     def recording(
         self, about: About, truth: Mapping[str, np.ndarray] | None = None, applied: np.ndarray | None = None
     ) -> Recording | None:
-        """Return the walk from the first command in force to the first that brakes; None if there was none.
+        """Return the walk under the gains of ``about``, up to the first command that brakes; None if there was none.
 
         Args:
             about: its origin.
             truth: columns of the format by name, with ``clock``, s; rows are joined where the clocks are the same.
-            applied: (T, 2 + J) commands that a simulated robot applied: clock, s, whether one applied, targets, rad.
+            applied: (T, 4 + J) commands of a simulated robot: clock, s, whether one applied, targets, rad, largest kp
+                and kd.
         """
         from go1exp.logs.recording import Recording
 
-        rows = self._newest_sent() if applied is None else self._reported(applied)
+        rows = self._newest_sent(about) if applied is None else self._reported(about, applied)
         if rows is None:
             return None
         kept, targets = rows
@@ -206,23 +215,26 @@ class Log:
         part = self.states.part_of(rows, name)[np.argsort(clock, kind="stable")]
         return np.minimum.accumulate(part[::-1])[::-1] if name == "t" else part
 
-    def _reported(self, applied: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the states (T,) bool measured under a command of standing up or walking, and their targets."""
+    def _reported(self, about: About, applied: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the states (T,) bool measured under a command with the gains of ``about``, and their targets."""
         clock = self.measured("clock")
         if not len(applied) or not len(clock) or np.isnan(clock).any():
             return None
         nearest = np.clip(np.searchsorted(applied[:, 0], clock - 1e-6), 0, len(applied) - 1)
         under = (np.abs(applied[nearest, 0] - clock) < 1e-6) & (applied[nearest, 1] > 0)
-        return (under, applied[nearest[under], 2:]) if under.any() else None
+        if not about.varied:
+            under &= (np.abs(applied[nearest, -2:] - [about.kp.max(), about.kd.max()]) < 1e-6).all(axis=1)
+        return (under, applied[nearest[under], 2:-2]) if under.any() else None
 
-    def _newest_sent(self) -> tuple[np.ndarray, np.ndarray] | None:
+    def _newest_sent(self, about: About) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the same for a robot that does not report the applied command: the newest one sent by then counts."""
         sent = self.cycles.part("number") > 0
         if not sent.any() or not self.states.count:
             return None
         at, target = self.cycles.part("t")[sent], self.cycles.part("q_target")[sent]
         newest = np.searchsorted(at, self.measured("t"), "right") - 1
-        under = (newest >= 0) & ~(self.cycles.part("damping")[sent] > 0)[newest]
+        others = np.isin(self.cycles.part("phase")[sent], [] if about.suspended else RISING)
+        under = (newest >= 0) & ~((self.cycles.part("damping")[sent] > 0) | others)[newest]
         return (under, target[newest[under]]) if under.any() else None
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ def report(bundle: Bundle, plan: Plan, outcome: Outcome, extra: Mapping[str, Any
         "status": outcome.status,
         "walked_s": outcome.walked,
         "phases": log.phases,
+        "stand_up": stand_up(log, np.array(bundle.metadata.nominal_stance), bundle.metadata.joints),
         "rate": plan.rate or 1.0 / bundle.metadata.policy_dt,
         "trained_rate": 1.0 / bundle.metadata.policy_dt,
         "timing": {**asdict(timing), "missed_share": timing.missed_share},
@@ -44,6 +45,27 @@ def report(bundle: Bundle, plan: Plan, outcome: Outcome, extra: Mapping[str, Any
         "memory_mb": outcome.memory_mb,
         "log": {"states": log.states.count, "overwritten": log.states.overwritten},
         **extra,
+    }
+
+
+def stand_up(log: Log, stance: np.ndarray, joints: Sequence[str]) -> dict[str, Any] | None:
+    """Return how a robot stood up and was handed over; None if it was not.
+
+    Returns:
+        ``seconds`` until it stood; ``joint`` furthest from the stance then and ``error``, rad; ``step``, the largest
+        change of a target from one cycle to the next in the hand-over, rad.
+    """
+    phase = log.cycles.part("phase")
+    rows = np.flatnonzero(phase == PHASES.index("handing_over"))
+    if not len(rows) or not {"standing_up", "handing_over"} <= log.phases.keys():
+        return None
+    error = np.abs(log.cycles.part("q")[rows[0]] - stance)
+    targets = log.cycles.part("q_target")[max(rows[0] - 1, 0) : rows[-1] + 2]
+    return {
+        "seconds": log.phases["handing_over"] - log.phases["standing_up"],
+        "joint": joints[int(error.argmax())],
+        "error": float(error.max()),
+        "step": float(np.abs(np.diff(targets, axis=0)).max()),
     }
 
 
@@ -113,6 +135,11 @@ def velocity_errors(log: Log, truth: Mapping[str, np.ndarray]) -> dict[str, Any]
 def summary_lines(content: Mapping[str, Any]) -> list[str]:
     """Return lines about the velocity of the walk, delays of packets and the timing of the simulated robot."""
     lines = []
+    if stood := content.get("stand_up"):
+        lines.append(
+            f"stood up in {stood['seconds']:.1f} s, {stood['joint']} {stood['error']:.2f} rad from the stance; "
+            f"hand-over: targets changed by at most {stood['step']:.2f} rad a cycle"
+        )
     if velocity := content.get("velocity"):
         mean, rmse, off = (
             " ".join(f"{value:+.3f}" if name == "mean" else f"{value:.3f}" for value in velocity[name])

@@ -19,7 +19,7 @@ from go1exp.base.errors import FAULTS, FIRST_FAULT, UNKNOWN_FAULT
 from go1exp.deploy.estimation.feet import FootCalibration
 from go1exp.deploy.runtime.bundle import Bundle
 from go1exp.deploy.runtime.commands import CommandConfig, Limited, make, range_array
-from go1exp.deploy.runtime.controller import Controller, Cycle, Estimator, Mover, Stages
+from go1exp.deploy.runtime.controller import STAND_PATIENCE, Controller, Cycle, Estimator, Mover, Stages
 from go1exp.deploy.runtime.estimate import BOTH, TORQUE, KalmanEstimator, NoEstimator, settings
 from go1exp.deploy.runtime.log import Log
 from go1exp.deploy.runtime.loop import MonotonicClock, Timing, run
@@ -160,7 +160,8 @@ class _Walk:
         self._commands, self._stop_requests = commands, stop_requests
         room = plan.keep
         if plan.seconds is not None:
-            room = min(room, plan.seconds + plan.stand_up + plan.lie_down + plan.brake + plan.patience + 1.0)
+            stages = plan.patience + plan.stand_up + STAND_PATIENCE + plan.hand_over + plan.lie_down + plan.brake
+            room = min(room, plan.seconds + stages + 1.0)
         self._log = Log(self.rate, room)
         self._walked, self._ended_by, self._velocity = 0.0, "", np.zeros(3)
         self._controller = Controller(

@@ -16,7 +16,7 @@ class SimConfig(Strict):
     """Setup of the simulated robot.
 
     Attributes:
-        start: standing in the nominal stance, lying on its belly, or suspended above the ground.
+        start: standing in the nominal stance, lying on its belly, crouched, sitting, or suspended above the ground.
         noise: noise of its sensors, relative to the paper's Table II.
         delay: delay of packets, each way, s.
         jitter: largest additional delay, drawn for each packet from 0 to this, s; so one may overtake another.
@@ -25,7 +25,7 @@ class SimConfig(Strict):
         seed: seed of noise, loss and random effects.
     """
 
-    start: Literal["standing", "lying", "suspended"] = "standing"
+    start: Literal["standing", "lying", "crouched", "sitting", "suspended"] = "standing"
     noise: NonNegative = 1.0
     delay: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     jitter: Annotated[float, Field(ge=0, le=0.5)] = 0.0

@@ -37,8 +37,15 @@ NOISE = {"joint_pos": 0.05, "joint_vel": 0.1, "imu_gyro": 0.01, "attitude": 0.05
 OWN_NOISE = {"imu_acc": 0.1, "foot_force": 2.0}
 """Standard deviations of noises that are not in Table II, m/s2 and N, as in ``conf/record.yaml``."""
 
-LYING_HEIGHT = 0.12
-"""Initial height of the trunk of a lying robot, m."""
+RISING: dict[str, tuple[tuple[float, ...], float, float]] = {
+    "lying": (LYING * 4, 0.12, 0.0),
+    "crouched": ((0.0, 1.2, -2.2) * 4, 0.22, 0.0),
+    "sitting": ((0.0, 0.7, -1.4) * 2 + (0.0, 1.9, -2.65) * 2, 0.3, -0.45),
+}
+"""Joints, rad, height of the trunk, m, and its pitch, rad, from which a robot settles before it stands up."""
+
+SPREAD = 0.1
+"""Half-width of the differences of a crouched or sitting robot's joints from these, rad, drawn by the seed."""
 
 SETTLE_S = 1.0
 """Settling time before the first command, s."""
@@ -128,13 +135,16 @@ class Robot:
     def _place(self) -> None:
         """Reset the robot and let it settle; default gains hold it until a command arrives."""
         plant, start = self._plant, self._config.start
-        joints = np.tile(LYING, robot.NUM_LEGS) if start == "lying" else robot.NOMINAL_STANCE
+        joints, height, pitch = RISING.get(start, (robot.NOMINAL_STANCE, robot.NOMINAL_HEIGHT, 0.0))
+        if start in ("crouched", "sitting"):
+            away = np.random.default_rng(self._config.seed).uniform(-SPREAD, SPREAD, robot.NUM_JOINTS)
+            joints = np.clip(joints + away, *robot.JOINT_POS_LIMITS.T)
         qpos, qvel = torch.zeros_like(plant.backend.qpos), torch.zeros_like(plant.backend.qvel)
         qpos[:, -robot.NUM_JOINTS :] = torch.as_tensor(joints)
         if start != "suspended":
             qpos[:, :3] = torch.as_tensor(self._origin)
-            qpos[:, 2] += LYING_HEIGHT if start == "lying" else robot.NOMINAL_HEIGHT
-            qpos[:, 3] = 1.0
+            qpos[:, 2] += height
+            qpos[:, 3], qpos[:, 5] = np.cos(pitch / 2), np.sin(pitch / 2)
         everyone = torch.ones(1, dtype=torch.bool)
         plant.backend.reset(everyone, qpos, qvel)
         self._target = qpos[:, -robot.NUM_JOINTS :].clone()
@@ -172,8 +182,9 @@ class Robot:
             self.apply(LowCmd(self._target[0].numpy().astype(float), nothing, nothing))
 
     def applied(self) -> np.ndarray:
-        """Return whether a command applied in the last step, 1 or 0, and its targets, rad: (13,)."""
-        return np.concatenate([[self.commanded and not self.braking], self._target[0].numpy()])
+        """Return whether a command applied in the last step, 1 or 0, its targets, rad, and largest gains: (15,)."""
+        gains = [float(values.max()) for values in self._gains]
+        return np.concatenate([[self.commanded and not self.braking], self._target[0].numpy(), gains])
 
     def step(self) -> None:
         """Advance by a tick; without a command for ``SILENCE`` the motors brake."""

@@ -203,7 +203,7 @@ class Server:
         counts: of packets.
         peer: address of the client; None before the first packet.
         truth: the newest of the trunk's true motion.
-        applied: the newest applied commands: whether one applied, and its targets, rad (``Robot.applied``).
+        applied: the newest applied commands: whether one applied, its targets, rad, and gains (``Robot.applied``).
         packets: packs states and unpacks commands.
         on_heard: called for each packet of ``peer`` with its time of arrival, s on ``time.perf_counter``'s clock.
         on_tick: called after each tick.
@@ -232,7 +232,7 @@ class Server:
         self.address: tuple[str, int] = self._socket.getsockname()
         self.peer: tuple[str, int] | None = None
         self._heard = -math.inf
-        self.counts, self.truth, self.applied = Counts(), Newest(len(TRUTH), kept), Newest(1 + JOINTS, kept)
+        self.counts, self.truth, self.applied = Counts(), Newest(len(TRUTH), kept), Newest(3 + JOINTS, kept)
 
     @property
     def port(self) -> int:
