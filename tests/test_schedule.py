@@ -33,7 +33,8 @@ def ramp(text: str, key: str = "x") -> str:
 
 
 def train_config(*overrides: str) -> Any:
-    return parse_train(compose("train", (*FLAT, *overrides)))
+    ours = [o for o in FLAT if "backend=warp" not in overrides or not o.startswith("backend.")]
+    return parse_train(compose("train", (*ours, *overrides)))
 
 
 def problems(*overrides: str) -> list[str]:
@@ -160,7 +161,7 @@ def test_a_captured_step_sees_what_was_changed() -> None:
     )
     fast = "set: reward.joint_velocity.weight, from: 0, to: -100"
     texts = (f"{stiff}, over: 0, start: 1", f"{late}, over: 0, start: 1", f"{fast}, over: 0, start: 1")
-    more = ("backend=warp", "actuator=delay", "rand=none", "event=none", "sim.episode_s=20")
+    more = ("backend=warp", "actuator=delay", "rand=none", "~event.push", "sim.episode_s=20")
     core, schedule = built(*more, *(ramp(text, f"k{i}") for i, text in enumerate(texts)))
     still = torch.zeros(8, robot.NUM_JOINTS, device=core.device)
 

@@ -153,7 +153,7 @@ class VerbSource(FileConfigSource):
         for group in (g for g in FOLDERS if "/" in g and (path == g or path.startswith(f"{g}/"))):
             return None if FOLDERS[group] in self._hidden else FOLDERS[group] + path.removeprefix(group)
         first, slash, rest = path.partition("/")
-        if (slash and first in self._hidden) or first in FOLDERS.values() or FOLDERS.get(first) in self._hidden:
+        if first in self._hidden or first in FOLDERS.values() or FOLDERS.get(first) in self._hidden:
             return None
         return folder_of(first, Path(self.path)).name + slash + rest if first else ""
 
@@ -172,7 +172,7 @@ class VerbSource(FileConfigSource):
     def is_group(self, config_path: str) -> bool:
         """Return whether there is a folder for the verb to see."""
         place = self._place(config_path)
-        return place is not None and place not in self._hidden and super().is_group(place)  # conf/sim.yaml, conf/sim
+        return place is not None and super().is_group(place)
 
     def is_config(self, config_path: str) -> bool:
         """Return whether there is a file for the verb to see."""
