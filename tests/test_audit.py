@@ -693,13 +693,13 @@ def test_commands_that_are_late_in_every_recording_are_named() -> None:
 
 def test_audit_of_a_folder_tells_of_clocks_apart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for k, late in enumerate((0, 0, 20, 0)):
-        sound = replace_episode(made(("steps", "multisine")[k % 2]), f"e{k}")
+        sound = replace_episode(made(("steps", "multisine")[k % 2]), "one")  # of one name: files tell them apart
         moved = {c: np.roll(v, late) for c, v in sound.channels.items() if c.startswith("q_target")}
         write(tmp_path / f"e{k}.parquet", with_(sound, **moved))
     out = tmp_path / "reports" / "audit.json"
     assert AUDIT.run([f"files=[{tmp_path}]", f"out={out}"]) == 4
     assert [Path(file).stem for file, report in json.loads(out.read_text()).items() if "clocks" in report] == ["e2"]
-    assert "e2.parquet: bad: joints answer their commands after -4" in capsys.readouterr().out
+    assert "e2.parquet: bad beside the others: joints answer their commands after -4" in capsys.readouterr().out
 
 
 # ---------------------------------------------------------------------- the report
@@ -890,6 +890,9 @@ def test_rows_that_their_neighbours_rule_out_are_named_and_left_out() -> None:
     wrapped = np.where(np.arange(ROWS) < 800, 2 * np.pi, 0.0) + r.channels["q_FL_calf"]
     np.testing.assert_array_equal(impossible(with_(r, q_FL_calf=wrapped)).rows, np.arange(ROWS) < 800)
     assert len(without(zeros, lost).t) == ROWS - 4
+    report = audit(zeros)
+    assert report.impossible == (300, 900, 901, 1700)
+    assert {f.check for f in report.flaws} == {"impossible"}
 
 
 @pytest.mark.parametrize(("rate", "spike"), [(100.0, 0.15), (500.0, 0.02)])

@@ -15,7 +15,7 @@ from go1exp.cli.places import long_enough, read_all
 from go1exp.config.schema.registry import ConfigError
 from go1exp.gap import files
 from go1exp.gap.result import EXIT_CODES, GapResult, NamedEffect
-from go1exp.logs.recording import Recording, RecordingError, write
+from go1exp.logs.recording import Recording, RecordingError, read, write
 from tests.test_gap_report import answer
 
 DEMO = sorted(Path("assets/demo/suspended_go1").glob("*.parquet"))
@@ -50,9 +50,11 @@ def test_a_recording_given_twice_and_a_copy_are_refused(tmp_path: Path) -> None:
     file = named_so(tmp_path / "run_0.parquet", "run_0")
     with pytest.raises(RecordingError, match=r"run_0.parquet: given twice"):
         read_all([str(tmp_path), str(file)])
-    named_so(tmp_path / "run_1.parquet", "run_0")
-    with pytest.raises(RecordingError, match=r"run_1.parquet: its name is 'run_0', as that of .*run_0.parquet"):
+    copy = named_so(tmp_path / "run_1.parquet", "run_0")
+    with pytest.raises(RecordingError, match=r"run_1.parquet: is a copy of .*run_0.parquet"):
         read_all(str(tmp_path))
+    write(copy, slower(read(copy), 1.1))
+    assert [r.meta.episode.split("/")[-1] for r in read_all(str(tmp_path))] == ["run_0", "run_1"]
 
 
 def slower(recording: Recording, factor: float) -> Recording:

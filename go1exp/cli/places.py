@@ -142,10 +142,10 @@ def long_enough(recordings: list[Recording], least: float) -> list[Recording]:
 def read_all(places: str | Sequence[str]) -> list[Recording]:
     """Read the recordings of folders and files, each under a name of its own.
 
-    Recordings of one name from several folders are named after those, too: ``day1/run_0``, ``day2/run_0``.
+    Recordings of one name are named after their folders, too (``day1/run_0``), in one folder after their files.
 
     Raises:
-        go1exp.logs.recording.RecordingError: if one is missing, damaged or given twice, or two share a name.
+        go1exp.logs.recording.RecordingError: if one is missing or damaged, or given twice, also as a copy.
     """
     from go1exp.logs.recording import RecordingError, read
 
@@ -158,12 +158,17 @@ def read_all(places: str | Sequence[str]) -> list[Recording]:
     if not shared:
         return recordings
     folders = _apart([path.resolve().parent for path in files])
+    together: dict[tuple[str, str], list[int]] = {}  # by folder and name
+    for k, recording in enumerate(recordings):
+        together.setdefault((folders[k], recording.meta.episode), []).append(k)
     renamed = [_renamed(r, folder, shared) for r, folder in zip(recordings, folders, strict=True)]
-    first: dict[str, Path] = {}
-    for path, recording in zip(files, renamed, strict=True):
-        if (other := first.setdefault(recording.meta.episode, path)) != path:
-            name = recording.meta.episode.rpartition("/")[2]
-            raise RecordingError(f"{path}: its name is {name!r}, as that of {other} beside it; one of them is a copy")
+    for (folder, _), (first, *others) in together.items():
+        for k in others:
+            if all(np.array_equal(x, recordings[first].channels.get(c, ())) for c, x in recordings[k].channels.items()):
+                raise RecordingError(f"{files[k]}: is a copy of {files[first]}")
+        for k in (first, *others) if others else ():
+            meta = replace(renamed[k].meta, episode=f"{folder}/{files[k].stem}")
+            renamed[k] = replace(renamed[k], meta=meta)
     return renamed
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -269,11 +270,11 @@ def _audit(container: dict[str, Any]) -> int:
         folders.setdefault(file.parent, {})[file] = report
         status = max(status, errors.AUDIT[report.verdict])
     for together in folders.values():
-        flaws = clock_flaws(list(together.values()))
-        for file, report in together.items():
-            if report.episode in flaws:
-                print(f"{file}: bad: {flaws[report.episode]}")
-                reports[str(file)] |= {"verdict": "bad", "clocks": flaws[report.episode]}
+        flaws = clock_flaws([replace(report, episode=file.stem) for file, report in together.items()])
+        for file in together:
+            if file.stem in flaws:
+                print(f"{file}: bad beside the others: {flaws[file.stem]}")
+                reports[str(file)] |= {"verdict": "bad", "clocks": flaws[file.stem]}
                 status = max(status, errors.AUDIT["bad"])
     if settings.out:
         out = Path(settings.out)

@@ -20,9 +20,8 @@ from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score.initial_state import measured, repeatability
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.search.clocks import OF_CLOCK, Contestant, contest, details, rows_of, same_rows
-from go1exp.logs.audit import audit, clock_flaws
-from go1exp.logs.audit.impossible import impossible, without
-from go1exp.logs.audit.limits import MOST_IMPOSSIBLE
+from go1exp.logs.audit import AuditReport, audit, clock_flaws
+from go1exp.logs.audit.impossible import without
 from go1exp.logs.recording import Recording, RecordingError
 from go1exp.robot.config import RobotConfig
 
@@ -116,10 +115,9 @@ def prepare(recordings: Sequence[Recording], robot: Robot, settings: GapSettings
         NotComparable: if too many of them cannot.
     """
     robot = robot.suited(recordings, settings.phase)
-    rows = sum(len(r.t) for r in recordings)
-    recordings, removed = _without_impossible_rows(recordings)
-    left_out = rows - sum(len(r.t) for r in recordings)
     reports = [audit(r) for r in recordings]
+    left_out = sum(len(report.impossible) for report in reports)
+    recordings, reports, removed = _without_impossible_rows(recordings, reports)
     clocks = clock_flaws(reports)
     flaws = [
         robot.flaws(r, report) + ([f"{report.episode}: {clocks[report.episode]}"] if report.episode in clocks else [])
@@ -140,16 +138,19 @@ def prepare(recordings: Sequence[Recording], robot: Robot, settings: GapSettings
     return robot, replace(ready, warnings=(*omitted, *ready.warnings), impossible=left_out)
 
 
-def _without_impossible_rows(recordings: Sequence[Recording]) -> tuple[list[Recording], list[str]]:
-    """Return recordings without such rows, and a line for each kind; one with many stays as it is, for the audit."""
-    kept, lines = [], []
-    for r in recordings:
-        marked = impossible(r)
-        few = 0.0 < marked.rows.mean() <= MOST_IMPOSSIBLE
-        kept.append(without(r, marked.rows) if few else r)
-        if few:
-            lines += [f"{r.meta.episode}: {f.channel}: {f.message}" for f in marked.findings]
-    return kept, lines
+def _without_impossible_rows(
+    recordings: Sequence[Recording], reports: Sequence[AuditReport]
+) -> tuple[list[Recording], list[AuditReport], list[str]]:
+    """Return recordings and reports without such rows, and a line for each kind; one with many stays as it is."""
+    kept, sound, lines = [], [], []
+    for r, report in zip(recordings, reports, strict=True):
+        if report.impossible:
+            lines += [f"{report.episode}: {f.channel}: {f.message}" for f in report.by_check("impossible")]
+            report = replace(report, findings=tuple(f for f in report.findings if f.check != "impossible"))
+            r = without(r, np.isin(np.arange(len(r.t)), report.impossible))
+        kept.append(r)
+        sound.append(report)
+    return kept, sound, lines
 
 
 def compare(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ import go1exp.logs.audit.signals as signals
 import go1exp.logs.audit.single as single
 from go1exp.logs.audit.commands import Delay
 from go1exp.logs.audit.copies import copies
-from go1exp.logs.audit.impossible import impossible
+from go1exp.logs.audit.impossible import impossible, without
 from go1exp.logs.audit.report import ORDER, AuditReport, Channel, Finding, worst
 from go1exp.logs.audit.signals import Log, finding
 from go1exp.logs.recording import Recording, problems, read
@@ -36,16 +36,18 @@ def audit_file(path: Path) -> AuditReport:
 def audit(recording: Recording) -> AuditReport:
     """Look for what is wrong with a recording; nothing is corrected and nothing is raised.
 
+    A few impossible rows are named and left out of the other checks, but for those of the clock.
     A recording that cannot be computed with (no clock, values that are not finite, a clock that runs backward) gets
     only the findings about its format.
     """
     format_findings = [_as_finding(line) for line in problems(recording)]
     if not _computable(recording):
         return _report(recording, format_findings, ())
-    log = Log(recording)
     excluded = impossible(recording)
+    few = excluded.rows.mean() <= limits.MOST_IMPOSSIBLE
+    log = Log(without(recording, excluded.rows) if few and excluded.findings else recording)
     findings, measured = _run_checks(log)
-    findings = [*excluded.findings, *findings]
+    findings = [*excluded.findings, *single.clock(Log(recording)), *findings]
     off, still = _times(log, ~log.on), _times(log, log.still)
     if off:
         total = sum(b - a for a, b in off)
@@ -58,7 +60,9 @@ def audit(recording: Recording) -> AuditReport:
     # A format error is not repeated where a check has already called the same channel bad.
     named = {f.channel for f in findings if f.verdict == "bad"}
     findings += [f for f in format_findings if f.channel not in named]
-    return _report(recording, findings, _channel_table(log, findings, measured), off, still)
+    left_out = tuple(map(int, np.flatnonzero(excluded.rows))) if few else ()
+    report = _report(recording, findings, _channel_table(log, findings, measured), off, still)
+    return replace(report, impossible=left_out)
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,6 @@ def _run_checks(log: Log) -> tuple[list[Finding], _Measured]:
     noise_findings, floors = single.noise(log, repeats)
     delay_findings, delays = commands.timing(log)
     findings = [
-        *single.clock(log),
         *stale_findings,
         *single.resolution(log),
         *noise_findings,

@@ -81,6 +81,7 @@ class AuditReport:
         findings: flaws first, then facts.
         torque_off: stretches with actuators off, (start, end) in s.
         still: stretches in which no joint moves, (start, end) in s.
+        impossible: numbers of the few rows that their neighbours rule out; the other checks are without them.
     """
 
     episode: str
@@ -91,6 +92,7 @@ class AuditReport:
     findings: tuple[Finding, ...]
     torque_off: tuple[tuple[float, float], ...] = ()
     still: tuple[tuple[float, float], ...] = ()
+    impossible: tuple[int, ...] = ()
 
     @property
     def verdict(self) -> Verdict:
