@@ -10,6 +10,7 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
+import pyarrow.parquet
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
@@ -303,3 +304,19 @@ def test_the_environment_refuses_overrides_in_the_words_of_the_command_line(over
         gymnasium.make("Go1-v0", overrides=[override])
     with pytest.raises(ConfigError, match=re.escape(said)):
         compose_checked("train", [override])
+
+
+@pytest.mark.parametrize("given", ["effect=[coulomb,payload,coulomb]", "effect=[a.yaml, a.yaml]"])
+def test_a_choice_that_is_there_twice_is_refused(given: str) -> None:
+    with pytest.raises(ConfigError, match=r"(coulomb|a\.yaml) is chosen twice"):
+        choices_from_files([given], "train")
+    assert choices_from_files(["effect=[coulomb,payload]", "ppo.hidden=[64,64]"], "train")
+
+
+def test_a_wrong_value_that_is_long_is_not_printed_whole(tmp_path: Path) -> None:
+    file = tmp_path / "long.parquet"
+    table = pyarrow.table({"t": [0.0]}).replace_schema_metadata({"go1exp": "x" * 50_000})
+    pyarrow.parquet.write_table(table, file)
+    with pytest.raises(RecordingError, match="metadata") as wrong:
+        recording.read(file)
+    assert len(str(wrong.value)) < 1000

@@ -6,6 +6,7 @@ import os
 import re
 import sys
 import warnings
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -209,11 +210,14 @@ def choices_from_files(arguments: Sequence[str], verb: str) -> list[str]:
     A list may mix files and names: ``effect=[mine.yaml,payload]``. Quotes round a path are taken off.
 
     Raises:
-        ConfigError: if a file is missing, empty, no YAML or no mapping; with every such file.
+        ConfigError: if a file is missing, empty, no YAML or no mapping, or a choice is there twice; with each of them.
     """
     chosen: list[str] = []
     problems: list[str] = []
     for argument in arguments:
+        group, listed, rest = argument.lstrip("+").partition("=[")
+        items = [item.strip() for item in ITEM.findall(rest)] if listed and group in groups_of(verb) else []
+        problems.extend(f"{argument}: {item} is chosen twice" for item, times in Counter(items).items() if times > 1)
         match = GROUP_IS_FILE.match(argument)
         group = match["group"] if match else ""
         if match is None or not (group in groups_of(verb) or (match["add"] and group in groups_in(config_folder()))):

@@ -158,7 +158,7 @@ def explain(error: ValidationError, path: str, known: Iterable[str]) -> list[str
         else:
             message = e["msg"].removeprefix("Value error, ")
             # A value that is quoted in it stays as it was written.
-            value, what = f"{key} = {e['input']!r}: ", message[:1].lower() + message[1:]
+            value, what = f"{key} = {repr(e['input'])[:400]}: ", message[:1].lower() + message[1:]
             if len(keys) < len(places) and lines and lines[-1].startswith(value):  # the next type that it may be of
                 lines[-1] += f" or {what.removeprefix('input should be ')}"
             else:
