@@ -950,7 +950,7 @@ def test_a_motion_of_a_hung_robot_becomes_a_recording_for_gap(bundle: str, tmp_p
     motion = played("chirp", 1.0, 250.0, (35.0, 0.7), 3)
     job = {"mover": motion, "motion": motion.name, "gains": motion.gains, "sim": {"start": "suspended", "noise": 0.0}}
     done = play(bundle, tmp_path, job=job, rate=motion.rate, seconds=motion.seconds)
-    assert done.output[-1] == f"walked for {motion.seconds:.1f} s, to the end"
+    assert done.output[-1] == f"played chirp for {motion.seconds:.1f} s, to the end"
     meta = done.recording.meta
     assert (meta.base, meta.excitation, meta.kp[0], meta.kd[0]) == ("fixed", "chirp", 35.0, 0.6875)
     assert meta.base_quat == pytest.approx((1.0, 0.0, 0.0, 0.0), abs=1e-6)

@@ -101,13 +101,27 @@ def test_a_network_in_their_convention_acts_as_the_original(preset: str, tmp_pat
     np.testing.assert_allclose(got["joint_target"], robot.NOMINAL_STANCE + 0.2 * wanted.numpy(), rtol=0, atol=1e-4)
 
 
+GRAVITY = (
+    "observation: [lin_vel, ang_vel, {term: projected_gravity, %s}, velocity_commands, joint_pos, joint_vel, actions]"
+)
+
+
 @pytest.mark.slow(*ABOUT)
-def test_a_wrong_joint_order_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("line", "likely"),
+    [
+        ("joint_order: sdk", "joint_order=joint_major"),
+        ("joint_sign: -1.0", "joint_sign reversed"),
+        (GRAVITY % "scale: -1.0", "gravity frame: sign"),
+        (GRAVITY % "quaternion: xyzw", "quaternion order: quaternion=wxyz"),
+    ],
+)
+def test_a_wrong_contract_is_named(line: str, likely: str, tmp_path: Path) -> None:
     spec, _ = spec_of(contract(tmp_path, "isaaclab"), {})
     file = exported(InTheirs(spec), tmp_path / "policy.pt")
     wrong = tmp_path / "wrong.yaml"
-    wrong.write_text(Path(contract(tmp_path, "isaaclab")).read_text() + "joint_order: sdk\n")
-    with pytest.raises(ExportError, match=r"likely mismatch.*joint_order=joint_major"):
+    wrong.write_text(Path(contract(tmp_path, "isaaclab")).read_text() + line + "\n")
+    with pytest.raises(ExportError, match=f"likely mismatch.*{likely}"):
         build_foreign(file, str(wrong))
 
 

@@ -75,6 +75,16 @@ def test_writing_leaves_the_metrics_to_the_next_writer(tmp_path: Path) -> None:
     assert given == row(1)
 
 
+def test_rows_that_a_resumed_run_should_have_are_missed(tmp_path: Path) -> None:
+    write(tmp_path, 1, 4)
+    (tmp_path / "metrics.csv").write_text("".join((tmp_path / "metrics.csv").read_text().splitlines(True)[:3]))
+    with pytest.warns(UserWarning, match=r"metrics\.csv: rows of 2 of 4 iterations are missing"):
+        write(tmp_path, 5, 6)
+    (tmp_path / "metrics.csv").unlink()
+    with pytest.warns(UserWarning, match=r"metrics\.csv: rows of 6 of 6 iterations are missing"):
+        write(tmp_path, 7, 7)
+
+
 @pytest.mark.parametrize("resumed_after", [0, 1, 3, 5])
 def test_a_continued_file_is_byte_for_byte_that_of_one_run(resumed_after: int, tmp_path: Path) -> None:
     write(tmp_path / "whole", 1, 7)

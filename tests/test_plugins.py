@@ -525,3 +525,23 @@ def test_two_files_of_one_name_are_both_kept() -> None:
     run_folder.write(Path("run"), container)
     assert len(list(Path("run/plugins").iterdir())) == 2
     assert len(parse_train(run_folder.read_config(Path("run"))).task.reward) == len(container["reward"])
+
+
+@pytest.mark.parametrize("group", ["reward", "termination", "observation"])
+def test_a_term_that_writes_into_the_snapshot_is_named_with_its_plugin_at_the_first_step(group: str) -> None:
+    shaped = {"reward": "[:, 0]", "termination": "[:, 0] > 9", "observation": ""}[group]
+    size = ", size=12" if group == "observation" else ""
+    write(
+        "my_terms.py",
+        f'from go1exp.extend import {group}\n\n\n@{group}("marks"{size})\ndef marks(s):\n'
+        f'    """Writes."""\n    s.joint_pos.clamp_(-9.0, 9.0)\n    return s.joint_pos{shaped}\n',
+    )
+    override = "+reward.marks.weight=1" if group == "reward" else f"+{group}.marks={{}}"
+    core = Go1Core(parse_task(compose("train", ["plugins=[my_terms.py]", override, "backend.threads=1"])), 2)
+
+    def begin() -> None:
+        core.reset()
+        core.step(torch.zeros(2, 12))
+
+    with pytest.raises(ConfigError, match=rf"^{group}\.marks \(my_terms\.py\): writes into joint_pos of the Snapshot"):
+        begin()

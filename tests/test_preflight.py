@@ -140,3 +140,10 @@ def test_a_curriculum_that_promotes_no_robot_is_warned_of(choice: str) -> None:
         preflight.warn_of_idle_curriculum(config(*rough, choice))
     preflight.warn_of_idle_curriculum(config(*rough))
     preflight.warn_of_idle_curriculum(config("terrain=rough", choice))
+
+
+def test_a_ground_that_does_not_fit_is_refused_by_its_own_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "free", lambda: 8_000_000_000)
+    preflight.check_memory(config("terrain=rough", "terrain.rows=2000"), CPU)
+    with pytest.raises(ConfigError, match=r"^terrain\.rows = 100000, cols = 20: 13,\S+ samples .* 8\.0 GB are free"):
+        preflight.check_memory(config("terrain=rough", "terrain.rows=100000"), CPU)

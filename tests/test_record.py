@@ -294,6 +294,7 @@ def test_settings_that_do_not_fit_are_refused(capsys: pytest.CaptureFixture[str]
         ("excitation=[{chirp: {band: [3.0, 1.0]}}]",): "excitation.chirp.band",
         ("physics_dt=0.0015",): "physics_dt = 0.0015: 1 / sensors.rate_hz = 0.002 must be a multiple of it",
         ("gains=[]",): "gains = []: at least one is needed",
+        ("gains=[[1e9,1.0]]",): "gains.0.0 = 1000000000.0: input should be less than or equal to 1023",
         ("excitation=[policy]",): "run: required for excitation=[policy]",
         ("support=ground",): "chirp is for a robot that is suspended",
         ("effect=nope.yaml",): "effect=nope.yaml: no such file",

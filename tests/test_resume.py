@@ -400,6 +400,14 @@ def test_with_no_whole_checkpoint_left_nothing_is_trained_over(killed_copy: Path
     assert (killed_copy / "metrics.csv").read_bytes() == before
 
 
+def test_a_run_without_a_checkpoint_begins_anew_and_says_so(killed_copy: Path, tmp_path: Path) -> None:
+    for file in checkpoint.checkpoints(killed_copy):
+        file.unlink()
+    done = cli(tmp_path, "train", f"resume={killed_copy}", "ppo.iterations=1")
+    assert done.returncode == 0, done.stderr
+    assert f"{killed_copy}: no checkpoint; training begins anew" in done.stdout
+
+
 # ---------------------------------------------------------------------- what a resumed run may change
 
 

@@ -173,6 +173,12 @@ def test_a_study_without_m_is_refused_with_the_line_to_type(tmp_path: Path) -> N
     assert "iterations:" in shown.stdout
 
 
+def test_a_sweep_that_would_never_begin_is_refused_at_once(tmp_path: Path) -> None:
+    done = cli(tmp_path, "train", "-m", "seed=range(0,1000000000)", "ppo.gamma=0.9,0.99", preload=LIGHT)
+    assert done.returncode == 2
+    assert done.stderr.strip() == "go1exp train: seed=range(0,1000000000): a sweep has at most 10,000 jobs"
+
+
 def test_what_the_command_line_says_of_a_key_replaces_what_a_study_says(tmp_path: Path) -> None:
     line = ("-m", "study=ablations", "backend=cpu", "seed=-1,-2", "+experiment/ablation=no_gait,no_latency")
     done = cli(tmp_path, "train", *line, preload=LIGHT)

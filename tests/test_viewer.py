@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import re
 import socket
+from http import HTTPStatus
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from websockets.datastructures import Headers
 
 from go1exp import robot
 from go1exp.base.errors import Expected
@@ -266,6 +270,13 @@ def test_only_the_token_opens_the_gate() -> None:
     assert len(gate.token) >= 20
     assert Gate(8080).token != gate.token
     assert {"HttpOnly", "SameSite=Strict"} <= {part.strip() for part in gate.header.split(";")}
+
+
+def test_a_request_to_two_hosts_is_a_bad_one() -> None:
+    twice = SimpleNamespace(path="/", headers=Headers([("Host", "127.0.0.1:8080"), ("Host", "127.0.0.1:8080")]))
+    answering = SimpleNamespace(respond=lambda status, text: status)
+    answer = Gate(8080).guarded(lambda connection, request: None)(answering, twice)
+    assert asyncio.run(answer) == HTTPStatus.BAD_REQUEST
 
 
 def test_a_second_viewer_takes_the_next_port() -> None:

@@ -14,7 +14,7 @@ from go1exp.cli.app import EXAMPLES, App, parse
 from go1exp.cli.places import remove_empty, writable
 from go1exp.cli.subjects import ROBOT_GROUPS
 from go1exp.config.schema import settings as schema
-from go1exp.config.schema.registry import ConfigError, NonNegative, Positive
+from go1exp.config.schema.registry import ConfigError, Gain, Positive
 from go1exp.config.schema.settings import subset
 from go1exp.deploy.runtime.controller import Stages
 from go1exp.deploy.sim_robot import SimConfig
@@ -73,7 +73,7 @@ class DeploySettings(Stages):
     feet: str | None
     command: tuple[float, float, float] | str
     motion: Annotated[str, Field(min_length=1)] | None
-    gains: tuple[NonNegative, NonNegative] | None
+    gains: tuple[Gain, Gain] | None
     sinusoid: SinusoidSettings
     rate: Annotated[float, Field(ge=10, le=1000)] | None
     seconds: Positive | None

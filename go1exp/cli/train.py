@@ -239,8 +239,10 @@ def _is_finished(job: TrainJob) -> bool:
 
 def _train(job: TrainJob, first: Weights | None) -> int | None:
     """Train in a folder that is locked, and keep its state; return the exit status."""
-    from go1exp.train import run_folder, run_state, trainer
+    from go1exp.train import checkpoint, run_folder, run_state, trainer
 
+    if job.resumed and run_state.read(job.run).state != "not started" and not checkpoint.checkpoints(job.run):
+        print(f"{job.run}: no checkpoint; training begins anew")
     run_folder.write(job.run, job.container)
     run_state.write(job.run, "running")
     print(f"run folder {job.run}", flush=True)

@@ -7,6 +7,7 @@ Tested with hydra-core 1.3.8 (omegaconf 2.3) and 1.4.0rc3 (omegaconf 2.4). Priva
 
 from __future__ import annotations
 
+import math
 import os
 import pickle
 import re
@@ -15,6 +16,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -40,15 +42,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.basecontainer import get_yaml_loader
 from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseException
 
-from go1exp.config.choices import (
-    FOLDERS,
-    UNREADABLE,
-    config_folder,
-    folder_of,
-    groups_of,
-    hidden_from,
-    why_unreadable,
-)
+from go1exp.config.choices import FOLDERS, UNREADABLE, config_folder, folder_of, groups_of, hidden_from, why_unreadable
 from go1exp.config.schema.registry import ConfigError
 
 OLD = hydra.__version__ < "1.4"
@@ -381,10 +375,14 @@ def composed_once(words: Sequence[str], folders: Sequence[Path]) -> Iterator[Non
         Hydra.get_mode = before  # type: ignore[method-assign]
 
 
+MOST_JOBS = 10_000
+"""Jobs of the largest sweep: each is composed and checked, in about 10 ms, before the first one starts."""
+
+
 def jobs_of_sweep(config: DictConfig) -> list[list[str]] | None:
     """Return the overrides of every job, as Hydra's own sweeper makes them; None if another sweeper decides.
 
-    A key on the command line replaces that of ``hydra.sweeper.params`` (a study).
+    A key on the command line replaces that of ``hydra.sweeper.params``. Raises ConfigError beyond ``MOST_JOBS``.
     """
     if not str(config.hydra.sweeper["_target_"]).endswith(f".{BasicSweeper.__name__}"):
         return None
@@ -394,4 +392,8 @@ def jobs_of_sweep(config: DictConfig) -> list[list[str]] | None:
     keys = {override.key_or_group for override in typed}
     listed = parser.parse_overrides([f"{key}={value}" for key, value in params.items()])
     parsed = [*(override for override in listed if override.key_or_group not in keys), *typed]
+    swept = {o.input_line: islice(o.sweep_string_iterator(), MOST_JOBS + 1) for o in parsed if o.is_sweep_override()}
+    counts = {line: sum(1 for _ in values) for line, values in swept.items()}
+    if math.prod(counts.values()) > MOST_JOBS:
+        raise ConfigError([f"{max(counts, key=counts.__getitem__)}: a sweep has at most {MOST_JOBS:,} jobs"])
     return [job for batch in BasicSweeper.split_arguments(parsed, None) for job in batch]

@@ -109,6 +109,12 @@ class TerrainConfig:
         """Shares of columns with boxes, bumps, ramps and without relief."""
         return self.boxes_proportion, self.bumps_proportion, self.ramps_proportion, self.flat_proportion
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Numbers of samples of a field of tiles, along y and x."""
+        tile, edge = _samples(self.tile_size, self), _samples(self.border, self)
+        return self.cols * tile + 2 * edge + 1, self.rows * tile + 2 * edge + 1
+
     def build(self) -> Terrain:
         """Build the ground; a subclass may build another kind."""
         return _build(self)
@@ -181,7 +187,7 @@ def _build(config: TerrainConfig) -> Terrain:
 
     types = column_types(config)
     tile, edge = _samples(config.tile_size, config), _samples(config.border, config)
-    heights = np.zeros((config.cols * tile + 2 * edge + 1, config.rows * tile + 2 * edge + 1))
+    heights = np.zeros(config.shape)
     for row in range(config.rows):
         for col, tile_type in enumerate(types):
             j, i = edge + col * tile, edge + row * tile

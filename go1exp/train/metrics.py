@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 import uuid
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -215,19 +216,22 @@ class CsvWriter(KVWriter):
         self._files = {name: run / name for name in ("metrics.csv", "timing.csv")}
         self._columns: dict[str, list[str]] = {}
         for name, path in self._files.items():
-            if path.exists():
-                self._cut(name, path, iteration)
+            kept = self._cut(name, path, iteration) if path.exists() else 0
+            if kept < iteration:
+                warnings.warn(f"{path}: rows of {iteration - kept} of {iteration} iterations are missing", stacklevel=2)
 
-    def _cut(self, name: str, path: Path, iteration: int) -> None:
+    def _cut(self, name: str, path: Path, iteration: int) -> int:
+        """Leave the whole rows up to ``iteration``; return their number."""
         with path.open(newline="") as file:
             rows = list(csv.reader(file))
         if not rows:
-            return
+            return 0
         self._columns[name] = rows[0]
         whole = [r for r in rows[1:] if len(r) == len(rows[0]) and 0 < _number(r[0]) <= iteration]
         text = io.StringIO(newline="")
         csv.writer(text).writerows([rows[0], *whole])
         write_text(path, text.getvalue())
+        return len(whole)
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
         """Append a row to each file."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import warnings
 
 import numpy as np
@@ -113,6 +114,9 @@ def check_devices(config: TrainConfig) -> None:
 CPU_ROBOT_BYTES = 6000
 """One more robot on the CPU: physics state, own model fields, the MDP's tensors (measured: 6.2 kB at 4096)."""
 
+SAMPLE_BYTES = 12
+"""A sample of the ground: float64 as it is built, float32 in the engine."""
+
 CONTACT_BYTES = 100
 """A contact that MuJoCo Warp has room for: positions, frame, solver parameters, geoms."""
 
@@ -149,6 +153,11 @@ def check_memory(config: TrainConfig, device: torch.device) -> None:
         ConfigError: with what it takes and what there is.
     """
     needed, available = needed_bytes(config), _available(device)
+    ground, free = config.task.terrain, memory.free()
+    samples = math.prod(ground.shape) if ground.kind == "tiles" else 0
+    if free is not None and SAMPLE_BYTES * samples > free:
+        size = f"terrain.rows = {ground.rows}, cols = {ground.cols}: {samples:,} samples of the ground"
+        raise ConfigError([f"{size}: {memory.too_much(SAMPLE_BYTES * samples, free)}"])
     if available is not None and needed > available:
         ppo = config.ppo
         beyond = {"num_envs": ppo.num_envs / 4096, "steps": ppo.steps / 24, "hidden": max(ppo.hidden) / 512}

@@ -40,6 +40,8 @@ class Strict:
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
+Gain = Annotated[float, Field(ge=0, le=1023)]
+"""Of a motor, N m/rad or N m s/rad; at most what the Go1's packets carry."""
 Count = Annotated[int, Field(ge=1)]
 CountOrZero = Annotated[int, Field(ge=0)]
 Duration = Annotated[float, Field(gt=0, le=1e9)]

@@ -44,8 +44,9 @@ STANDS, WALKS = 0, 1
 SECONDS, SETTLE = 2.0, 0.7
 """Length of the simulation, and its beginning, in which errors do not count, s."""
 
-BETTER = 0.4
-"""By how much another contract must follow the commands more closely to be a likely mismatch; 1 is perfect."""
+BETTER, PART = 0.1, 0.5
+"""By how much another contract must follow the commands more closely to be a likely mismatch, where 1 is perfect; and
+which part of the stated contract's error may remain (chosen: a wrong attitude costs a quarter on flat ground)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,8 +169,9 @@ def _other_readings(observed: Observed) -> Iterator[tuple[str, dict[str, Any]]]:
     name = ALIASES.get(observed.term, observed.term)
     if name == "projected_gravity":
         yield "gravity frame: sign", {"scale": tuple(-np.broadcast_to(observed.scale, 3))}
-        yield "gravity frame: quaternion=inverse", {"quaternion": "inverse"}
-        yield "quaternion order: quaternion=xyzw", {"quaternion": "xyzw"}
+        for kind in sorted({"wxyz", "xyzw", "inverse"} - {observed.quaternion}):
+            what = "gravity frame" if "inverse" in (kind, observed.quaternion) else "quaternion order"
+            yield f"{what}: quaternion={kind}", {"quaternion": kind}
     if name == "joint_position":
         yield f"joint_position: relative={not observed.relative}", {"relative": not observed.relative}
     usual = {ALIASES.get(e["term"], e["term"]): e.get("scale", 1.0) for e in PRESETS["legged_gym"]["observation"]}
@@ -226,7 +228,7 @@ def _likelier(stated: Outcome, config: TrainConfig, spec: Spec, network: Network
     others = list(alternatives(spec))
     outcomes, _, _ = drive(config, [other for _, other in others], network)
     stands = [(r.follows, name) for r, (name, _) in zip(outcomes, others, strict=True) if not r.falls]
-    least = -np.inf if stated.falls else stated.follows + BETTER
+    least = -np.inf if stated.falls else max(stated.follows + BETTER, 1.0 - PART * (1.0 - stated.follows))
     return [f"{name} (follows {share:.0%})" for share, name in sorted(stands, reverse=True) if share > least][:3]
 
 

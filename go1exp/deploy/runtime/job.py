@@ -173,7 +173,7 @@ def run_job(job: Job, say: Say) -> int:
     files = save(Path(job.out), _about(job, bundle), outcome.log, content, recorded, applied)
     for line in (str(outcome.timing), *summary_lines(content), f"written to {', '.join(map(str, files))}"):
         say(line)
-    say(end_line(outcome))
+    say(end_line(outcome, job.motion))
     return outcome.status
 
 

@@ -164,14 +164,14 @@ def summary_lines(content: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def end_line(outcome: Outcome) -> str:
-    """Return a line on the end of a walk; a fault with its time since the first cycle."""
+def end_line(outcome: Outcome, motion: str | None = None) -> str:
+    """Return a line on the end of a walk, or of a ``motion``; a fault with its time since the first cycle."""
     if fault := outcome.fault:
         began = min(outcome.log.phases.values(), default=fault.t)
         hint = "; a busy machine, and a simulated robot? stale=0.2" if fault.name == "stale_state" else ""
         return f"fault: {fault.name} at {fault.t - began:.3f} s after the start: {fault.message}{hint}"
     end = f"stopped by {outcome.requested_by}" if outcome.requested_by else "to the end"
-    return f"walked for {outcome.walked:.1f} s, {end}"
+    return f"{f'played {motion}' if motion else 'walked'} for {outcome.walked:.1f} s, {end}"
 
 
 def save(

@@ -10,6 +10,7 @@ import functools
 import os
 import platform
 import resource
+import signal
 import statistics
 import subprocess
 import sys
@@ -135,7 +136,11 @@ def _one_env(task: TaskConfig, index: int) -> Go1Env:
 def subproc_subject(task: TaskConfig) -> tuple[Subject, Callable[[], None]]:
     """Our own single environment in SB3's SubprocVecEnv, a process per core; also how to end it."""
     count = os.cpu_count() or 1
-    vec = SubprocVecEnv([functools.partial(_one_env, task, i) for i in range(count)], start_method="spawn")
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for this process, which then ends the others
+    try:
+        vec = SubprocVecEnv([functools.partial(_one_env, task, i) for i in range(count)], start_method="spawn")
+    finally:
+        signal.signal(signal.SIGINT, before)
     vec.reset()
     rng = np.random.default_rng(0)
 

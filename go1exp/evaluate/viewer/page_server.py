@@ -61,6 +61,8 @@ class Gate:
 
         async def process_request(connection: Any, request: Any) -> Any:
             headers = request.headers
+            if any(len(headers.get_all(name)) > 1 for name in ("Host", "Origin")):
+                return connection.respond(http.HTTPStatus.BAD_REQUEST, "go1exp: one Host and one Origin at most\n")
             cookie = "; ".join(headers.get_all("Cookie"))
             if not self.admits(request.path, cookie, headers.get("Origin"), headers.get("Host", "")):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, REFUSAL)

@@ -12,7 +12,7 @@ from pydantic import ConfigDict, Field
 from go1exp import robot
 from go1exp.base import memory
 from go1exp.base.wording import counted
-from go1exp.config.schema.registry import STRICT, ConfigError, NonNegative, Positive, Term
+from go1exp.config.schema.registry import STRICT, ConfigError, Gain, Positive, Term
 from go1exp.logs.excitations import Motion
 from go1exp.logs.record.sensors import SensorConfig
 
@@ -69,7 +69,7 @@ class RecordingConfig:
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
-    gains: tuple[tuple[NonNegative, NonNegative], ...]
+    gains: tuple[tuple[Gain, Gain], ...]
     seconds: Positive
     seeds: tuple[Annotated[int, Field(ge=0)], ...]
     repeats: Annotated[int, Field(ge=0)]

@@ -7,7 +7,7 @@ columns: the frame, that of one policy step before, and so on, each with the noi
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import torch
@@ -16,11 +16,32 @@ from torch import Tensor
 from go1exp.base.tensors.memory import Memory
 from go1exp.config.schema.history import frame_width, history_columns, width
 from go1exp.config.schema.physics import WarpBackend
+from go1exp.config.schema.plugins import origin
 from go1exp.config.schema.registry import ConfigError, Term
 from go1exp.mdp.feet import impossible
 from go1exp.mdp.types import Snapshot, TermSetup
 from go1exp.sim.schedule import WEIGHT
 from go1exp.sim.task import TaskConfig
+
+
+def _reading(group: str, term: Term, call: Call) -> Call:
+    """Return a plugin's term that its first call shows to read the Snapshot alone; ConfigError if it writes into it."""
+    tried = False
+
+    def checked(s: Snapshot) -> Tensor:
+        nonlocal tried
+        if tried:
+            return call(s)
+        tried = True
+        given = {f.name: getattr(s, f.name) for f in fields(s)}
+        before = {name: (value, value._version) for name, value in given.items() if isinstance(value, Tensor)}
+        value = call(s)
+        if written := [name for name, (tensor, version) in before.items() if tensor._version != version]:
+            where = f"{group}.{term.key} ({origin(term.entry)})"
+            raise ConfigError([f"{where}: writes into {', '.join(written)} of the Snapshot; clone what is to change"])
+        return value
+
+    return checked
 
 
 class Frames(Memory):
@@ -152,9 +173,9 @@ class StepTerms:
         def calls(group: str, terms: Sequence[Term]) -> list[Call]:
             """Return the terms as functions of a Snapshot."""
             made: list[Call] = [t(setup) if t.entry.remembers else t for t in terms]
-            named = zip(terms, made, strict=True)
+            named = list(zip(terms, made, strict=True))
             self._remembering |= {f"{group}.{t.key}": call for t, call in named if t.entry.remembers}
-            return made
+            return [call if origin(t.entry) is None else _reading(group, t, call) for t, call in named]
 
         kept = (t for t in task.reward if t.slots[WEIGHT] != 0.0 or f"reward.{t.key}.{WEIGHT}" in changing)
         self.rewards = [self._with_changing(t) for t in kept]
