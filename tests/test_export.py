@@ -547,7 +547,7 @@ def test_the_runtime_does_on_the_traces_readings_what_the_environment_did(good: 
     commands = lambda t: trace["input.command"][len(sent)]  # noqa: E731
     estimator = SimpleNamespace(update=lambda state: None, ahead=lambda age: trace["input.base_lin_vel_b"][len(sent)])
     safety = Safety(robot.JOINTS, robot.JOINT_POS_LIMITS, np.array(good.metadata.torque_limit))
-    gains = {"kp": np.array(good.metadata.kp), "kd": np.array(good.metadata.kd)}
+    gains: dict[str, Any] = {"kp": np.array(good.metadata.kp), "kd": np.array(good.metadata.kd)}
     runtime = Controller(
         good,
         cast(Link, link),
