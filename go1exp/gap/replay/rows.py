@@ -39,6 +39,10 @@ class Machine(Protocol):
         """Whether it stands, so that it feels what acts on its trunk and on the ground."""
 
     @property
+    def guessed_gains(self) -> bool:
+        """Whether the model has gains, for recordings that say none."""
+
+    @property
     def effort(self) -> tuple[float, ...]:
         """Peak torque (J,), N m."""
 

@@ -64,6 +64,7 @@ class Go1:
     on_ground: bool = False
     tolerances: Tolerances = DECLARED
     free_trunk: ClassVar[bool] = True
+    guessed_gains: ClassVar[bool] = False
 
     @property
     def effort(self) -> tuple[float, ...]:

@@ -142,7 +142,7 @@ def exact_aliases(search: Search, effect: str, joints: Sequence[str]) -> tuple[s
     effects = np.array([linear.probes[k].key[0] for k in layout.probe])
     at = np.isin(layout.joint, [-1, *(everyone.index(j) for j in joints)])
     rivals = [{name} for name in dict.fromkeys(effects) if name != effect]
-    if getattr(state.machine, "guessed_gains", False) and tolerances.identification(effect).of_gains:
+    if state.machine.guessed_gains and tolerances.identification(effect).of_gains:
         rivals.append({name for name in members("effect") if tolerances.identification(name).of_gains} - {effect})
     columns = np.flatnonzero((effects == effect) & at)
 
