@@ -266,12 +266,15 @@ def log_to_wandb(run: Path, iterations: range) -> str:
     return (run / "wandb_id").read_text()
 
 
-def test_an_offline_wandb_run_holds_the_metrics_and_is_continued_under_its_id(tmp_path: Path, no_account: None) -> None:
+def test_an_offline_wandb_run_holds_the_metrics_and_is_continued_under_its_id(
+    tmp_path: Path, no_account: None, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = tmp_path / "run"
     run.mkdir()
     identity = log_to_wandb(run, range(1, 4))
     (file,) = run.rglob("*.wandb")
     assert identity in file.name
+    assert f"send it with: wandb sync {file.parent}\n" in capsys.readouterr().out
     found = history(file)
     assert [h["train/kl"] for h in found] == [0.25, 0.5, 0.75]
     assert [h["_step"] for h in found] == [64, 128, 192]

@@ -6,6 +6,7 @@ import csv
 import io
 import math
 import os
+import shlex
 import subprocess
 import sys
 import uuid
@@ -102,7 +103,10 @@ class WandbWriter(KVWriter):
                 self._run.log({"evaluations": _table(numbers)}, step=self._step)
         if self._config.artifacts:
             self._log_artifacts()
+        folder = Path(self._run.dir).parent
         self._run.finish()
+        if wandb_mode(self._config) == "offline":
+            print(f"logged offline; send it with: wandb sync {shlex.quote(str(folder))}")
 
     def _log_artifacts(self) -> None:
         checkpoints = sorted((self._folder / "checkpoints").glob("*.pt"))[-1:]
