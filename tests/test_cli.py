@@ -115,6 +115,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("train rand.body_velocity.range=[-1e300,1]", ("rand.body_velocity.range.0 = -1e+300: must be from -100",)),
         ("eval run=x episodes=0", ("episodes = 0", "greater than or equal to 1")),
         ("eval run=x settle_s=30", ("settle_s = 30.0", "duration_s = 20.0")),
+        ("report x evaluation.duration_s=1", ("report: evaluation.settle_s = 2.0: must be",)),
         ("bench suite=fast", ("suite = 'fast'", "'env', 'train'", "'deploy'")),
         # a misspelt choice
         ("train rand=tabel1", ("rand=tabel1", "did you mean 'table1'?")),

@@ -62,6 +62,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("record import opt", {"options="}),
         ("record import go2", {"go2_in_air"}),
         ("gap lo", {"localise", "logs=", "loop"}),
+        ("compare pa", {"paper"}),
+        ("compare paper pa", {"paper"}),
         ("list re", {"reward"}),
         ("list group=rew", {"group=reward"}),
         ("list --config-dir mine we", {"weather"}),

@@ -15,7 +15,7 @@ from typing import Any
 
 from go1exp.base.errors import REFUSED, Expected
 from go1exp.base.paths import data_root
-from go1exp.cli.verbs import POSITIONAL, SUBVERBS, VERBS, parted
+from go1exp.cli.verbs import LISTS, POSITIONAL, SUBVERBS, VERBS, parted
 from go1exp.config.choices import CONFIG_DIR, choice_files, config_folder, given_folders, groups_in, groups_of, load
 
 OPTIONS = ("--help", "--cfg", "--multirun", "--config-dir", "--resolve", "--package", "--info")
@@ -31,6 +31,9 @@ SUFFIXES = {
     "files": (".parquet",),
     "bundle": (".zip",),
     "file": (".zip", ".npz"),
+    "network": (".onnx", ".pt", ".jit"),
+    "subjects": (".zip",),
+    "folders": (),
     "checkpoint": (".pt",),
     "command": (".csv",),
     "path": ("",),
@@ -173,7 +176,7 @@ def _by_position(verb: str, word: str, before: Sequence[str], folders: Sequence[
     """Complete a word that is given by position alone."""
     keys = POSITIONAL.get(verb, ())
     place = len(parted(before)[2])
-    if not keys or (place >= len(keys) and keys != ("files",)):
+    if not keys or (place >= len(keys) and keys[0] not in LISTS):
         return []
     key = keys[min(place, len(keys) - 1)]
     if key == "stage":
@@ -182,7 +185,13 @@ def _by_position(verb: str, word: str, before: Sequence[str], folders: Sequence[
         return [name for name in _listed(folders) if name.startswith(word)]
     if key == "source":
         return sorted(name for name in _importers() if name.startswith(word))
-    return list(_paths(word, SUFFIXES.get(key, ("",)))) if word else []
+    named = [name for name in _shipped() if name.startswith(word)] if key == "subjects" else []
+    return [*named, *_paths(word, SUFFIXES.get(key, ("",)))]
+
+
+def _shipped() -> list[str]:
+    """Return the names of the shipped policies."""
+    return sorted(file.parent.name for file in (data_root() / "assets/policies").glob("*/config.yaml"))
 
 
 def _listed(folders: Sequence[Path]) -> list[str]:
@@ -222,8 +231,7 @@ def _members(verb: str, key: str, value: str, before: Sequence[str], folders: Se
             answers += [a for a in _paths(value, (".yaml", ".yml")) if a not in answers] if value else []
         return answers
     if last in POLICIES:
-        shipped = sorted(file.parent.name for file in (data_root() / "assets/policies").glob("*/config.yaml"))
-        answers += [name for name in shipped if name.startswith(value)]
+        answers += [name for name in _shipped() if name.startswith(value)]
     if last in WORDS and (key != "robot" or verb == "deploy"):
         answers += [name for name in WORDS[last] if name.startswith(value)]
     if (verb, key) == ("list", "group"):

@@ -151,8 +151,9 @@ def explain(error: ValidationError, path: str, known: Iterable[str]) -> list[str
         key = ".".join([path, *keys]).strip(".")
         if unknown:
             lines.append(unknown_name(key, str(e["loc"][-1]), known, "key") + f" (given: {e['input']!r})")
-        elif e["type"] == "value_error" and not e["loc"]:  # rules of a dataclass, one "key: rule" per line
-            lines += [f"{path}.{line}".strip(".") for line in e["msg"].removeprefix("Value error, ").splitlines()]
+        elif e["type"] == "value_error" and (not e["loc"] or isinstance(e["input"], Mapping)):
+            # rules of a dataclass, one "key: rule" per line
+            lines += [f"{key}.{line}".strip(".") for line in e["msg"].removeprefix("Value error, ").splitlines()]
         elif e["type"] == "problems":  # a term inside this one: one line each, from that parameter's name on
             lines += [".".join([path, *map(str, e["loc"][:-1]), line]).strip(".") for line in e["msg"].splitlines()]
         elif e["type"] in ("missing", "missing_argument"):

@@ -20,7 +20,7 @@ class Constant:
     """One velocity, from rest after ``rest``.
 
     Attributes:
-        kind: constant.
+        kind: constant, steps or sine.
         velocity: x m/s, y m/s, yaw rad/s.
         rest: time with a zero command at the start, s.
     """
@@ -40,7 +40,7 @@ class Steps:
     """Velocities one after the other.
 
     Attributes:
-        kind: steps.
+        kind: constant, steps or sine.
         velocities: each as x m/s, y m/s, yaw rad/s.
         hold: time of each, s; the last one stays.
     """
@@ -60,7 +60,7 @@ class Sine:
     """A sine on all three axes at once.
 
     Attributes:
-        kind: sine.
+        kind: constant, steps or sine.
         amplitude: of x m/s, y m/s, yaw rad/s.
         period: s.
     """
