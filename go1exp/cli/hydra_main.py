@@ -215,9 +215,10 @@ def choices_from_files(arguments: Sequence[str], verb: str) -> list[str]:
     chosen: list[str] = []
     problems: list[str] = []
     for argument in arguments:
-        group, listed, rest = argument.lstrip("+").partition("=[")
-        items = [item.strip() for item in ITEM.findall(rest)] if listed and group in groups_of(verb) else []
-        problems.extend(f"{argument}: {item} is chosen twice" for item, times in Counter(items).items() if times > 1)
+        group, _, value = argument.lstrip("+").partition("=")
+        lists = re.findall(r"\[[^\]]*", value) if group in groups_of(verb) else []  # of a sweep there are several
+        for items in ([item.strip() for item in ITEM.findall(one[1:])] for one in lists):
+            problems.extend(f"{argument}: {item} is chosen twice" for item, n in Counter(items).items() if n > 1)
         match = GROUP_IS_FILE.match(argument)
         group = match["group"] if match else ""
         if match is None or not (group in groups_of(verb) or (match["add"] and group in groups_in(config_folder()))):

@@ -147,7 +147,7 @@ def diagonal_load(s: Snapshot) -> Tensor:
 
 @reward("foot_clearance")
 def foot_clearance(
-    s: Snapshot, *, target_height: Positive = 0.08, scale: Positive = 0.05, speed_scale: Positive = 2.0
+    s: Snapshot, *, target_height: Positive = 0.08, scale: Positive = 0.005, speed_scale: Positive = 2.0
 ) -> Tensor:
     """Moving feet at the right height: exp(-sum_i (z_i - h)^2 tanh(k u_i) / scale), in (0, 1].
 
