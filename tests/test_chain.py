@@ -33,9 +33,8 @@ LIVELY = (
 )
 """A policy of two iterations that moves the legs a little."""
 
-TORQUE, SPEED, ANGLE = 0.2, 0.25, 0.006
-"""Bounds on the RMSE of a log of the simulator in the simulator, N m, rad/s, rad. With commands a sample off, torques
-are beyond the first (0.3; 0.1 without)."""
+TORQUE, SPEED, ANGLE = 0.05, 0.25, 0.006
+"""Bounds on the RMSE of a log of the simulator in the simulator, N m, rad/s, rad."""
 
 
 @pytest.fixture
@@ -72,7 +71,7 @@ def test_from_training_to_the_replayed_log(
     assert verb("train", *SMALL, *LIVELY, "hydra.run.dir=run") == 0
     assert verb("export", "run=run", "out=walk.zip", "seconds=0.2") == 0
     assert verb("export", "check", "walk.zip") == 0
-    words = ["command=[0.4,0,0]", "seconds=1", "stand_up=0.5", "lie_down=1.5", "brake=0.5", "stale=5"]
+    words = ["command=[0.4,0,0]", "seconds=2", "stand_up=0.5", "lie_down=1.5", "brake=0.5", "stale=5"]
     robot = ["sim.start=lying", "sim.noise=0.1", "truth=true"]
     with nullcontext() if real_time else lockstep():
         assert verb("deploy", "walk.zip", *words, *robot, "out=logs") == 0
@@ -105,4 +104,4 @@ def test_from_training_to_the_replayed_log(
     assert found["q"] < ANGLE
     assert part["times_floor"] < 1.5
     for late in (-1, 1):
-        assert replayed(log, late).quantity("tau_est") > TORQUE
+        assert replayed(log, late).quantity("tau_est") > 2.0 * found["tau_est"]  # four to seven times

@@ -54,7 +54,7 @@ def parse(settings: Any, parts: Mapping[str, Any]) -> tuple[dict[str, Ramp], lis
             problems.append(f"schedule.{key}.set = {ramp.path!r}: is set by schedule.{setters[ramp.path]} too")
         setters[ramp.path] = key
         problems += _target_problems(f"schedule.{key}", ramp, parts)
-    silent = silent_rows(parts["reward"], ramps.values())
+    silent = silent_rows(parts.get("reward", ()), ramps.values())
     return {k: _waiting(ramp, silent) for k, ramp in ramps.items() if not _left_out(ramp, parts)}, problems
 
 
