@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from websockets.datastructures import Headers
+from websockets.http11 import Request
 
 from go1exp import robot
 from go1exp.base.errors import Expected
@@ -273,7 +274,7 @@ def test_only_the_token_opens_the_gate() -> None:
 
 
 def test_a_request_to_two_hosts_is_a_bad_one() -> None:
-    twice = SimpleNamespace(path="/", headers=Headers([("Host", "127.0.0.1:8080"), ("Host", "127.0.0.1:8080")]))
+    twice = Request("/", Headers([("Host", "127.0.0.1:8080"), ("Host", "127.0.0.1:8080")]))
     answering = SimpleNamespace(respond=lambda status, text: status)
     answer = Gate(8080).guarded(lambda connection, request: None)(answering, twice)
     assert asyncio.run(answer) == HTTPStatus.BAD_REQUEST

@@ -114,6 +114,7 @@ class Schedule:
         """Continue from ``state_dict`` after ``steps`` of all robots together."""
         for key, of_key in state.items():
             for recent, kept in zip(self._recent[key], of_key["recent"], strict=True):
+                recent.clear()
                 recent.extend(kept)
             self._started[key] = of_key["started"]
         self._apply(steps)

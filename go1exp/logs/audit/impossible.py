@@ -132,7 +132,7 @@ def _spikes(t: np.ndarray, x: np.ndarray, least: float) -> np.ndarray:
 
 
 def _alone(t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return samples (T,) bool that that are off alone: by more than usual, than their neighbours, than at a bend."""
+    """Return samples (T,) bool that are off alone: by more than usual, than their neighbours, and than at a bend."""
     off, steps = _off(t, x), np.abs(np.diff(x))
     noise = max(float(np.quantile(off[off > 0.0], 0.9)) if off.any() else 0.0, _step(x) / np.sqrt(12.0))
     rows = (_returned(x) > 0.0) & (off > max(limits.UNUSUAL * noise, float(np.quantile(steps, 0.95))))
