@@ -24,8 +24,8 @@ import pytest
 import torch
 
 from go1exp import robot
-from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.config.compose import compose
+from go1exp.extend.testing.actuators import go1_actuators
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.actuator.actuator_net import ActuatorNet, NetInfo, Provenance, group_names
 from go1exp.sim.env.core import Go1Core
@@ -145,25 +145,7 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.fixture
 def drives() -> Callable[..., ActuatorSetup]:
     """Describe the drives of n Go1 robots at 2 ms; keyword arguments change that."""
-
-    def make(n: int, **changes: Any) -> ActuatorSetup:
-        def spread(values: tuple[float, float, float]) -> torch.Tensor:
-            return torch.as_tensor(robot.per_joint(values))
-
-        usual: dict[str, Any] = {
-            "num_envs": n,
-            "physics_dt": 0.002,
-            "joints": robot.JOINTS,
-            "effort_limit": spread(robot.EFFORT_LIMIT),
-            "velocity_limit": spread(robot.VELOCITY_LIMIT),
-            "armature": spread(robot.ROTOR_ARMATURE),
-            "random": EnvRandom(0, n),
-            "device": torch.device("cpu"),
-            "dtype": torch.float64,
-        }
-        return ActuatorSetup(**{**usual, **changes})
-
-    return make
+    return go1_actuators
 
 
 def random_net(

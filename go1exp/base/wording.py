@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
+Start = Literal["standing", "lying", "crouched", "sitting", "suspended"]
+"""Initial pose of the simulated robot: in the nominal stance, on its belly, ..., or held above the ground."""
+
 NOT_FOR_TRAINING = "Not for training."
 """How a file of effects says on its first line that training should not take it."""
 

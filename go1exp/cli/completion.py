@@ -11,10 +11,11 @@ import re
 import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from go1exp.base.errors import REFUSED, Expected
 from go1exp.base.paths import data_root
+from go1exp.base.wording import Start
 from go1exp.cli.verbs import LISTS, POSITIONAL, SUBVERBS, VERBS, parted
 from go1exp.config.choices import CONFIG_DIR, choice_files, config_folder, given_folders, groups_in, groups_of, load
 
@@ -53,7 +54,7 @@ WORDS = {
     "share": ("all", "kind", "none"),
     "target": ("tau_est", "joint_torque"),
     "device": ("auto", "cpu", "cuda"),
-    "start": ("standing", "lying", "crouched", "sitting", "suspended"),
+    "start": get_args(Start),
     "selection": ("max_t", "gain", "bic"),
     "correction": ("holm", "none"),
     "wandb": ("offline", "online"),

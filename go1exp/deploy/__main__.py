@@ -6,9 +6,11 @@ import argparse
 import sys
 from collections.abc import Sequence
 from functools import partial
+from typing import get_args
 
 from go1exp.base.errors import REFUSED, Expected, end
 from go1exp.base.signals import handled, interrupt
+from go1exp.base.wording import Start
 
 
 def positive(text: str) -> float:
@@ -44,9 +46,6 @@ TIMES = (
 """Settings of the plan in seconds: name, type and meaning."""
 
 
-STARTS = ("standing", "lying", "crouched", "sitting", "suspended")
-
-
 def arguments(given: Sequence[str]) -> argparse.Namespace:
     """Read the command line."""
     from go1exp.deploy.runtime.walk import Plan
@@ -68,7 +67,7 @@ def arguments(given: Sequence[str]) -> argparse.Namespace:
         parser.add_argument(f"--{name.replace('_', '-')}", type=kind, default=getattr(Plan, name), help=meaning)
     parser.add_argument("--out", default="runs/deploy", help="folder of the logs")
     sim = parser.add_argument_group("with --robot sim")
-    sim.add_argument("--start", choices=STARTS, default="standing")
+    sim.add_argument("--start", choices=get_args(Start), default="standing")
     sim.add_argument("--noise", type=float, default=1.0, help="relative to the paper's Table II")
     sim.add_argument("--delay", type=float, default=0.0, help="of packets, each way, s")
     sim.add_argument("--jitter", type=float, default=0.0, help="largest additional delay of each packet, s")

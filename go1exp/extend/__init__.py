@@ -45,53 +45,10 @@ from go1exp.robot.actuators import ActuatorSetup, ModelFields
 from go1exp.sim.actuator.motors import Gains
 from go1exp.sim.effects.base import Effect, Gears, Identification, Measured, Param
 
-__all__ = [
-    "ActuatorSetup",
-    "Effect",
-    "ExcitationError",
-    "Fraction",
-    "Gains",
-    "Gears",
-    "Identification",
-    "JointValues",
-    "KinematicState",
-    "Measured",
-    "Memory",
-    "Mirror",
-    "ModelFields",
-    "Motion",
-    "NonNegative",
-    "NotMeasured",
-    "Param",
-    "Positive",
-    "PositiveRange",
-    "Range",
-    "Recording",
-    "RecordingError",
-    "Snapshot",
-    "Speed",
-    "SpeedRange",
-    "Stream",
-    "TermSetup",
-    "Trace",
-    "actuator",
-    "always_on",
-    "columns",
-    "command",
-    "curriculum",
-    "each_within",
-    "effect",
-    "event",
-    "excitation",
-    "importer",
-    "joint_columns",
-    "measure",
-    "mirror",
-    "observation",
-    "randomization",
-    "rate",
-    "recording",
-    "reward",
-    "robot",
-    "termination",
-]
+__all__ = ["actuator", "command", "curriculum", "effect", "event", "excitation", "importer", "measure", "observation"]
+__all__ += ["randomization", "reward", "termination"]
+__all__ += ["Fraction", "JointValues", "NonNegative", "Positive", "PositiveRange", "Range", "Speed", "SpeedRange"]
+__all__ += ["ActuatorSetup", "Effect", "Gains", "Gears", "Identification", "Measured", "ModelFields", "Param"]
+__all__ += ["KinematicState", "Memory", "Mirror", "NotMeasured", "Snapshot", "Stream", "TermSetup", "Trace"]
+__all__ += ["ExcitationError", "Motion", "Recording", "RecordingError", "always_on", "each_within", "mirror", "robot"]
+__all__ += ["columns", "joint_columns", "rate", "recording"]

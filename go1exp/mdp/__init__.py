@@ -3,14 +3,4 @@
 Importing the package registers every term, from this explicit list.
 """
 
-from go1exp.mdp import commands, curricula, events, observations, randomizations, rewards, rewards_literal
-
-__all__ = [
-    "commands",
-    "curricula",
-    "events",
-    "observations",
-    "randomizations",
-    "rewards",
-    "rewards_literal",
-]
+from go1exp.mdp import commands, curricula, events, observations, randomizations, rewards, rewards_literal  # noqa: F401

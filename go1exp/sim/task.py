@@ -10,9 +10,9 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cache
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 import go1exp.mdp  # noqa: F401  (registers every term)
 from go1exp import robot
@@ -24,6 +24,7 @@ from go1exp.config.schema.registry import (
     FolderName,
     NonNegative,
     Positive,
+    Strict,
     Term,
     as_json,
     bind,
@@ -42,11 +43,9 @@ from go1exp.sim import schedule
 from go1exp.sim.effects.rules import actuator_problems
 from go1exp.sim.terrain import TerrainConfig
 
-CountOrZero = Annotated[int, Field(ge=0)]
-
 
 @dataclass(frozen=True)
-class SimConfig:
+class SimConfig(Strict):
     """Time.
 
     Attributes:
@@ -55,8 +54,6 @@ class SimConfig:
         episode_s: length of an episode, s.
         spread_starts: first episodes begin at random times, so that not all end together.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     physics_dt: Annotated[float, Field(gt=0, le=0.02)]
     policy_dt: Annotated[float, Field(gt=0, le=0.1)]
@@ -75,15 +72,13 @@ class SimConfig:
 
 
 @dataclass(frozen=True)
-class ActionConfig:
+class ActionConfig(Strict):
     """Action to joint target: target = nominal stance + ``scale`` x action cut at +-``clip``.
 
     Attributes:
         scale: rad per unit of action.
         clip: bound of the policy's output.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     scale: Positive
     clip: Positive
@@ -115,7 +110,7 @@ class TaskConfig:
 
 
 @dataclass(frozen=True)
-class ProcessConfig:
+class ProcessConfig(Strict):
     """Settings at the top level of the YAML.
 
     Attributes:
@@ -128,8 +123,6 @@ class ProcessConfig:
         start_from: run folder, or name of a shipped policy, whose weights a new run begins with.
         plugins: files and packages with terms of your own, such as [my_terms.py] (docs/extending.md).
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     seed: Annotated[int, Field(ge=0, le=2**32 - 1)]
     device: Annotated[str, one_of(r"auto|cpu|cuda(:\d+)?", "auto, cpu, cuda, or one of several as cuda:1")]

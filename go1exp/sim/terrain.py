@@ -13,13 +13,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import AfterValidator, ConfigDict, Field
+from pydantic import AfterValidator
 
-from go1exp.config.schema.registry import STRICT, NonNegative, Positive, ordered
+from go1exp.config.schema.registry import Count, CountOrZero, NonNegative, Positive, Strict, ordered
 from go1exp.mdp.ground import GroundHeight
 
 TILE_TYPES = ("boxes", "bumps", "ramp_up", "ramp_down", "flat")
@@ -27,12 +27,11 @@ TILE_TYPES = ("boxes", "bumps", "ramp_up", "ramp_down", "flat")
 
 FloatArray = NDArray[np.float64]
 
-Count = Annotated[int, Field(ge=1)]
 NonNegativeRange = Annotated[tuple[NonNegative, NonNegative], AfterValidator(ordered)]
 
 
 @dataclass(frozen=True)
-class TerrainConfig:
+class TerrainConfig(Strict):
     """Everything that shapes the ground. With `kind` "flat" the other numbers are checked and not used.
 
     Ranges ``(low, high)`` belong to difficulty 0 and 1; difficulty d = row / (rows - 1) interpolates linearly. Numbers
@@ -67,8 +66,6 @@ class TerrainConfig:
         ValueError: If fields do not fit together; the message names every such field and what it may be.
     """
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
-
     kind: Literal["flat", "tiles"] = "flat"
     rows: Count = 10
     cols: Count = 20
@@ -76,7 +73,7 @@ class TerrainConfig:
     border: NonNegative = 20.0
     resolution: Positive = 0.1
     platform: Positive = 2.0
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: CountOrZero = 0
     boxes_proportion: NonNegative = 0.3
     bumps_proportion: NonNegative = 0.3
     ramps_proportion: NonNegative = 0.3

@@ -21,6 +21,9 @@ from go1exp.train.ppo import LOSS_FIGURES, AdaptivePPO, GaussianPolicy, MeanRoll
 FIGURES = (*LOSS_FIGURES, "kl", "finite", "taken")
 """What is kept of each gradient step; ``finite`` is 1 if its gradients were, ``taken`` if the update had not ended."""
 
+SINGLES = ("rewards", "starts", "values", "log_probs", "advantages", "returns", "ended", "totals", "lengths")
+"""Parts of a rollout that are one number for each robot and step."""
+
 WARM_UP = 3
 """Steps before one is recorded, as CUDA graphs ask."""
 
@@ -42,25 +45,20 @@ class DeviceRolloutBuffer(MeanRolloutBuffer):
     def reset(self) -> None:
         """Empty the buffer; its memory is made once."""
         if not hasattr(self, "data"):
-            widths = {"observations": self.obs_shape, "actions": (self.action_dim,), "means": (self.action_dim,)}
-            singles = (
-                "rewards",
-                "starts",
-                "values",
-                "log_probs",
-                "advantages",
-                "returns",
-                "ended",
-                "totals",
-                "lengths",
-            )
-            shapes: dict[str, Any] = {**widths, **dict.fromkeys(singles, ())}
-            size = (self.buffer_size, self.n_envs)
-            self.data = {name: torch.zeros(*size, *shape, device=self.device) for name, shape in shapes.items()}
+            shapes: dict[str, Any] = {
+                "observations": self.obs_shape,
+                "actions": (self.action_dim,),
+                "means": (self.action_dim,),
+            }
+            self.data = {name: self._zeros(*shape) for name, shape in shapes.items()}
+            self.data |= {name: self._zeros() for name in SINGLES}
             self.whole = self.data
             self._next = torch.zeros(1, dtype=torch.int64, device=self.device)  # on the device: steps are replayed
         self._next.zero_()
         self.pos, self.full, self.generator_ready = 0, False, False
+
+    def _zeros(self, *shape: int) -> Tensor:
+        return torch.zeros(self.buffer_size, self.n_envs, *shape, device=self.device)
 
     def share_with(self, group: Group) -> None:
         """Collect together with ``group``."""

@@ -118,12 +118,19 @@ class Group:
         """
         if self.size == 1:
             return state
-        each = self._of_all(_on_host(state))
-        return joined(each, robots)
+        return joined(self._of_all(_mapped(state, Tensor.cpu)), robots)
 
     def part(self, state: Any, robots: int) -> Any:
         """Return this member's part of what ``whole`` returned; ``robots`` are this member's."""
-        return state if self.size == 1 else _part(state, robots * self.size, self.rows(robots * self.size))
+        if self.size == 1:
+            return state
+        total = robots * self.size
+        rows = self.rows(total)
+
+        def share(values: Tensor) -> Tensor:
+            return values.narrow(values.shape.index(total), rows.start, robots) if total in values.shape else values
+
+        return _mapped(state, share)
 
     def _of_all(self, local: Any) -> list[Any]:
         each: list[Any] = [None] * self.size
@@ -179,14 +186,14 @@ def _together(key: str, values: Sequence[float]) -> float:
     return sum(known) / (1 if key in SUMMED else len(known)) if known else math.nan
 
 
-def _on_host(state: Any) -> Any:
-    """Return plain data with all tensors on the host."""
+def _mapped(state: Any, change: Callable[[Tensor], Tensor]) -> Any:
+    """Return plain data with all of its tensors changed."""
     if isinstance(state, Tensor):
-        return state.cpu()
+        return change(state)
     if isinstance(state, Mapping):
-        return {key: _on_host(value) for key, value in state.items()}
+        return {key: _mapped(value, change) for key, value in state.items()}
     if isinstance(state, list | tuple):
-        return [_on_host(value) for value in state]
+        return [_mapped(value, change) for value in state]
     return state
 
 
@@ -200,20 +207,6 @@ def joined(each: Sequence[Any], robots: int) -> Any:
     if isinstance(first, list):
         return [joined([state[k] for state in each], robots) for k in range(len(first))]
     return first
-
-
-def _part(state: Any, total: int, rows: slice) -> Any:
-    if isinstance(state, Tensor):
-        return (
-            state.narrow(state.shape.index(total), rows.start, rows.stop - rows.start)
-            if total in state.shape
-            else state
-        )
-    if isinstance(state, Mapping):
-        return {key: _part(value, total, rows) for key, value in state.items()}
-    if isinstance(state, list):
-        return [_part(value, total, rows) for value in state]
-    return state
 
 
 class SharedNoise(DiagGaussianDistribution):

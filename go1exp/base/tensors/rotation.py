@@ -5,12 +5,8 @@ Everywhere else ``scipy.spatial.transform.Rotation`` is the tool.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
-
-if TYPE_CHECKING:
-    from torch import Tensor
+from torch import Tensor
 
 
 def rotate(quat: Tensor, vector: Tensor) -> Tensor:

@@ -24,21 +24,8 @@ if TYPE_CHECKING:
 
     from go1exp.deploy.estimation import _kalman
 
-__all__ = [
-    "GRAVITY",
-    "WIDTH",
-    "EstimatorError",
-    "FilterConfig",
-    "Filters",
-    "Status",
-    "from_json",
-    "go1",
-    "load",
-    "make_filter",
-    "sample",
-    "scaler",
-    "to_json",
-]
+__all__ = ["GRAVITY", "WIDTH", "EstimatorError", "FilterConfig", "Filters", "Status", "from_json", "go1", "load"]
+__all__ += ["make_filter", "sample", "scaler", "to_json"]
 
 SOURCES = ("force", "torque", "height")
 """The order of ``Source`` in ``cpp/kalman.hpp``."""

@@ -8,12 +8,12 @@ None; its name is that of the fault in the log.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
+from go1exp.base.errors import FAULTS
 from go1exp.robot.messages import LowCmd, LowState
 
 SDK_RANGE = {"hip": (-1.047, 1.047), "thigh": (-0.663, 2.966), "calf": (-2.721, -0.837)}
@@ -130,8 +130,8 @@ class Safety:
             now: the runtime's clock, s.
         """
         if self.fault is None:
-            for name, rule in RULES.items():
-                if (state is not None or name in STATELESS) and (message := rule(self, state, command, now)):
+            for name in RULES if state is not None else STATELESS:
+                if message := getattr(self, name)(state, command, now):
                     self.fault = Fault(name, now, message)
                     break
         if self.fault is not None or command is None or state is None:
@@ -164,8 +164,8 @@ class Safety:
 
     def rehearse(self, state: LowState, command: LowCmd) -> None:
         """Do the work of a review without a result, for ``Controller.rehearse``."""
-        for rule in (Safety.not_finite, Safety.attitude, Safety.tilt, Safety.joint_range):
-            rule(self, state, command, state.t)
+        for rule in (self.not_finite, self.attitude, self.tilt, self.joint_range):
+            rule(state, command, state.t)
         self._cut(state, command)
 
     def _cut(self, state: LowState, command: LowCmd) -> np.ndarray:
@@ -247,19 +247,8 @@ class Safety:
         return f"the motors' power is {power:.0f} W, the limit is {self.config.power:g} W"
 
 
-Rule = Callable[[Safety, Any, LowCmd | None, float], str | None]
-
-RULES: dict[str, Rule] = {
-    "operator_stop": Safety.operator_stop,
-    "stale_state": Safety.stale_state,
-    "not_finite": Safety.not_finite,
-    "attitude": Safety.attitude,
-    "tilt": Safety.tilt,
-    "joint_range": Safety.joint_range,
-    "torque": Safety.torque,
-    "power": Safety.power,
-}
-"""Name of a fault -> its rule, in the order of evaluation; the first rule with a message is the fault."""
+RULES = tuple(name for name in FAULTS if hasattr(Safety, name))
+"""Names of the rules, in the order of evaluation; the first rule with a message is the fault."""
 
 STATELESS = ("operator_stop", "not_finite")
 """Rules that apply before the first state too; until it arrives the motors brake."""

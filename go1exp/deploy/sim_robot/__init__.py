@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from go1exp.config.schema.registry import Duration, Fraction, NonNegative, Strict
+from go1exp.base.wording import Start
+from go1exp.config.schema.registry import CountOrZero, Duration, Fraction, NonNegative, Strict
 from go1exp.config.schema.settings import settings
 
 
@@ -25,13 +26,13 @@ class SimConfig(Strict):
         seed: seed of noise, loss and random effects.
     """
 
-    start: Literal["standing", "lying", "crouched", "sitting", "suspended"] = "standing"
+    start: Start = "standing"
     noise: NonNegative = 1.0
     delay: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     jitter: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     loss: Annotated[Fraction, Field(lt=1)] = 0.0
     feet: Literal["newton", "raw"] = "newton"
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: CountOrZero = 0
 
 
 @settings
@@ -48,7 +49,7 @@ class SimSettings(SimConfig):
     """
 
     address: str = "127.0.0.1:8007"
-    tile: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] = (0, 0)
+    tile: tuple[CountOrZero, CountOrZero] = (0, 0)
     seconds: Duration | None = None
     viewer: Literal["web"] | None = None
     host: str = "127.0.0.1"

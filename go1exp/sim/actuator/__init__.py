@@ -1,5 +1,3 @@
 """Actuators: position target and joint state -> torque. Importing the package registers every actuator."""
 
-from go1exp.sim.actuator import delay, motors, net
-
-__all__ = ["delay", "motors", "net"]
+from go1exp.sim.actuator import delay, motors, net  # noqa: F401

@@ -25,10 +25,9 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from go1exp.base.errors import REFUSED
 from go1exp.base.files import opened, write_bytes
-from go1exp.config.schema.registry import STRICT, Expected, NonNegative, Positive, explain
+from go1exp.config.schema.registry import STRICT, Count, Expected, NonNegative, Positive, explain
 
 if TYPE_CHECKING:
-    pass
     from onnx import NodeProto, TensorProto
 
 
@@ -41,7 +40,6 @@ Share = Literal["all", "kind", "none"]
 Target = Literal["tau_est", "joint_torque"]
 """Training target: torque that the actuator reports, or torque at the joint from inverse dynamics."""
 
-Count = Annotated[int, Field(ge=1)]
 Name = Annotated[str, Field(min_length=1)]
 
 MAGIC = "go1exp actuator net"

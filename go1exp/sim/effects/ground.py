@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import torch
 
@@ -12,9 +11,6 @@ from go1exp.config.schema.physics import ContactConfig
 from go1exp.config.schema.registry import effect
 from go1exp.robot.actuators import ModelFields
 from go1exp.sim.effects.base import Effect, Identification, Param
-
-if TYPE_CHECKING:
-    pass
 
 
 @effect("foot_friction")

@@ -21,7 +21,7 @@ from pydantic import Field
 
 from go1exp.base.errors import Expected
 from go1exp.base.files import write_json
-from go1exp.config.schema.registry import Count
+from go1exp.config.schema.registry import Count, CountOrZero
 from go1exp.config.schema.settings import settings
 from go1exp.train.early_stop import file_of, logged
 from go1exp.train.sweep import index, trials
@@ -57,10 +57,10 @@ class TuneSettings:
     metric: Annotated[str, Field(min_length=1)]
     direction: Literal["maximize", "minimize"]
     average: Count
-    warmup: Annotated[int, Field(ge=0)]
+    warmup: CountOrZero
     prune: bool
     storage: str | None
-    seed: Annotated[int, Field(ge=0)]
+    seed: CountOrZero
     out: Annotated[str, Field(min_length=1)]
 
 
