@@ -19,14 +19,12 @@ from go1exp.config.schema.physics import ContactConfig, read_contact
 from go1exp.config.schema.registry import Expected
 from go1exp.gap.result import GapResult, GapSettings
 
-RESULT = "verdict.json"
-"""Name of the file in the output folder."""
+RESULT = "verdict.json"  # name of the file in the output folder
 
 EFFECT, CALIBRATION, COMPENSATING = "effect.yaml", "calibration.yaml", "compensating.yaml"
 """What is missing; the nominal parameters within their tolerances; what only makes up for something unknown."""
 
-APPLIED = "applied.json"
-"""What the written files do at the step of training."""
+APPLIED = "applied.json"  # what the written files do at the step of training
 
 MADE_OF_IT = (EFFECT, CALIBRATION, COMPENSATING, APPLIED, "report.html", "report.json")
 """Files that are made of a result, beside it."""

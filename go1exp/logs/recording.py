@@ -43,8 +43,7 @@ from go1exp.robot import JOINTS, LEGS
 if TYPE_CHECKING:
     import pyarrow.parquet as pq
 
-KEY = b"go1exp"
-"""Key of the schema metadata that holds the JSON object."""
+KEY = b"go1exp"  # key of the schema metadata that holds the JSON object
 
 JOINT_QUANTITIES = ("q", "qd", "q_target", "tau_est", "tau_cmd")
 VECTORS = {
@@ -329,7 +328,6 @@ def read(path: Path) -> Recording:
 
 
 def _begins_as_parquet(path: Path) -> bool:
-    """Return whether a file begins with the four bytes that every Parquet file begins with."""
     with path.open("rb") as file:
         return file.read(4) == b"PAR1"
 

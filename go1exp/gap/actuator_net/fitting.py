@@ -160,7 +160,6 @@ def _train_groups(
     hidden: tuple[int, ...],
     on_progress: OnProgress | None,
 ) -> list[Trained]:
-    """Train one network for each group of joints, with hidden layers of the widths ``hidden``."""
     nets = []
     for k, group in enumerate(groups):
         on_epoch = None if on_progress is None else partial(on_progress, f"{what} {group}")
@@ -171,7 +170,6 @@ def _train_groups(
 def _references(
     info: NetInfo, shares: Mapping[str, _Share], settings: FitSettings, on_progress: OnProgress | None
 ) -> list[Reference]:
-    """Return what the net is compared with, on the held-out rows."""
     training, held_out = shares["train"], shares["held_out"]
     references = [*recorded(held_out.rows), linear(training.rows, training.group, held_out.rows, held_out.group)]
     if not settings.half_net:
@@ -183,7 +181,6 @@ def _references(
 
 
 def _predict(net: ActuatorNet, share: _Share) -> np.ndarray:
-    """Return the net's torque at every row (R,), N m."""
     torque = np.empty(len(share.rows))
     for k in np.unique(share.group):
         torque[share.group == k] = net.torque(share.of_group(k).x, int(k))

@@ -27,8 +27,7 @@ MOST_STEPS = 250_000  # the same as physics steps of all windows, times joints o
 HINT = "give the robot of the logs: model=NAME or model=FILE.yaml (go1exp list model, docs/own_robot.md)"
 """What to do where logs are of another robot than the model."""
 
-TELLING = ("delay", "torque")
-"""Checks of the audit that a missing effect may fail; they say nothing against the log."""
+TELLING = ("delay", "torque")  # checks of the audit that a missing effect may fail; they say nothing against the log
 
 
 @dataclass(frozen=True)
@@ -102,9 +101,7 @@ def spaced(recordings: Sequence[Recording], settings: GapSettings, joints: int) 
 
 
 SHOWN = 3  # recordings of one contact that a message lists
-
-CHOOSE = "contact=stiff (conf/contact, docs/contact.md)"
-"""How one is chosen."""
+CHOOSE = "contact=stiff (conf/contact, docs/contact.md)"  # how one is chosen
 
 
 def on_feet(recordings: Sequence[Recording]) -> list[Recording]:

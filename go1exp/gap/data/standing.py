@@ -133,11 +133,8 @@ IMU_DELAY_SD = 0.001
 IMU_BIAS_SD = (0.02, 0.2)
 """Constant errors of gyro, rad/s, and accelerometer, m/s2 (chosen: those of a consumer's IMU after a warm-up)."""
 
-IMU = "imu"
-"""Name of the third quantity: gyro x y z, accelerometer x y z, and nothing in the other places of a row."""
-
-TRUNK = "trunk"
-"""Name of a fourth quantity, which is never compared: attitude w-x-y-z, and velocity in the world."""
+IMU = "imu"  # name of the third quantity: gyro x y z, accelerometer x y z, and nothing in the other places of a row
+TRUNK = "trunk"  # name of a fourth quantity, which is never compared: attitude w-x-y-z, and velocity in the world
 
 AXES = ("imu_gyro_x", "imu_gyro_y", "imu_gyro_z", "imu_acc_x", "imu_acc_y", "imu_acc_z")
 

@@ -155,8 +155,7 @@ def limits_of(robot: Robot, windows: Windows, targets: Sequence[np.ndarray], saf
     return Limits(centre, angles, speed, torque, safety.power)
 
 
-SIZES = ("amplitude", "large", "stride", "lift", "sway")
-"""Parameters of excitations that say how far the joints go."""
+SIZES = ("amplitude", "large", "stride", "lift", "sway")  # parameters of excitations that say how far the joints go
 
 MOTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("chirp", {"band": (0.1, 4.0)}),

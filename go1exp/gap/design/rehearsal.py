@@ -21,10 +21,7 @@ from go1exp.logs.recording import FLAG, Recording, RecordingError, joint_channel
 
 SETTLE_S = 0.5  # time for which the first target is held before a design begins, s
 CLOCK = 0.01  # relative error of a logger's clock up to which commands are sent at the rate that recordings say
-
-PLAYED = ("q", "qd", "tau_est")
-"""What is kept of a rehearsal: angles, speeds, and the torque that the drives make."""
-
+PLAYED = ("q", "qd", "tau_est")  # what is kept of a rehearsal: angles, speeds, and the torque that the drives make
 FADE_S = 1.0  # time at the beginning of a motion that is not evaluated, s: motions grow from rest
 
 
@@ -177,7 +174,6 @@ class Stage:
 
 
 def _later(recording: Recording, seconds: float) -> Recording:
-    """Return a recording without its first seconds."""
     keep = recording.t >= recording.t[0] + seconds
     if keep.sum() < 2:
         raise RecordingError(f"{recording.meta.episode}: shorter than {seconds:g} s")

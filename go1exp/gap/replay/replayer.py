@@ -147,7 +147,6 @@ class Replayer:
         return self._inputs[dt]
 
     def _batch(self, rows: Rows, dt: float, softly: bool) -> np.ndarray:
-        """Run a batch, all windows at once."""
         w = self.windows
         plant = self._plant(rows, dt, softly)
         index = torch.as_tensor(rows.window)

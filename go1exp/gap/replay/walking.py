@@ -134,8 +134,7 @@ HEAVY = 1.0e6
 what moves them."""
 
 
-MOVED = ("q", "qd", "base")
-"""Fields of rows that move an initial state, or what the IMU says."""
+MOVED = ("q", "qd", "base")  # fields of rows that move an initial state, or what the IMU says
 
 
 @dataclass

@@ -61,7 +61,6 @@ def _cell(value: float, kind: str, top: float, marked: bool, title: str) -> Cell
 
 
 def _top(result: GapResult) -> float | None:
-    """Return the largest value of the heat maps; None without one."""
     both = [m.excess for m in (result.before, result.after) if m is not None and np.isfinite(m.excess).any()]
     return max((float(np.nanmax(excess)) for excess in both), default=None)
 

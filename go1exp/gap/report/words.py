@@ -42,8 +42,7 @@ UNITS: dict[str, str] = {"q": "rad", "qd": "rad/s", "tau_est": "N m"}
 TRUNK_UNITS: dict[str, str] = {"imu_gyro": "rad/s", "imu_acc": "m/s²"}
 """Logged quantity of the trunk, along x, y and z -> unit."""
 
-ALL_UNITS: dict[str, str] = UNITS | TRUNK_UNITS
-"""Logged quantity -> unit."""
+ALL_UNITS: dict[str, str] = UNITS | TRUNK_UNITS  # logged quantity -> unit
 
 ERRORS: dict[str, str] = {
     "null": "nominal model",
@@ -53,8 +52,7 @@ ERRORS: dict[str, str] = {
 }
 """Key of ``GapResult.excess`` -> label."""
 
-GROUND = ("squat", "drop")
-"""Excitations of a standing robot; all others are of a suspended one."""
+GROUND = ("squat", "drop")  # excitations of a standing robot; all others are of a suspended one
 
 
 def errors(result: GapResult) -> list[tuple[str, str]]:

@@ -36,8 +36,7 @@ GO1 = "go1"
 ONE_GROUP = (tuple(range(robot.NUM_JOINTS)),)
 """Legs feel each other through a trunk that is free: all joints are one group."""
 
-NEEDED = ("t", "q", "qd", "q_target")
-"""Channels, or quantities, without which nothing can be replayed."""
+NEEDED = ("t", "q", "qd", "q_target")  # channels, or quantities, without which nothing can be replayed
 
 
 NO_SENSORS = 1 << 13
@@ -117,7 +116,6 @@ class Go1:
         return backend, actuator_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
 
     def _model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool) -> tuple[Any, Any]:
-        """Return the compiled model, and where its sensors are."""
         raise NotImplementedError
 
 

@@ -99,9 +99,7 @@ REGIMES = (
     *("stiction", "reversal", "slow", "fast", "high torque", "after a step", "actuators off"),
     *("early in the episode", "late in the episode", "small angle", "large angle"),
 )
-ON_FEET = ("stance", "swing", "impact")
-"""Regimes of a standing robot, beside the others."""
-
+ON_FEET = ("stance", "swing", "impact")  # regimes of a standing robot, beside the others
 IMPACT_S = 0.03  # time after a foot begins to carry weight that counts as impact, s
 AT_REST, SLOW, FAST = 0.1, 1.0, 5.0  # speeds up to which a joint rests or is slow, and from which it is fast, rad/s
 TURN_S = 0.02  # time about a change of direction, s

@@ -129,7 +129,6 @@ def _scored(scorer: Scorer, model: Model, residual: np.ndarray, windows: np.ndar
 
 
 def _moves(scorer: Scorer, models: Sequence[Model], common: Table, dt: float) -> list[Move]:
-    """Return a Gauss-Newton step for each model."""
     windows, machine = common.windows, scorer.replayer.machine
     steps = []
     for model, (probes, fresh) in zip(models, _refreshed(scorer, models, windows, dt), strict=True):

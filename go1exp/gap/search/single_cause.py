@@ -112,7 +112,6 @@ def _with(score: Scorer, theta: Theta, key: Key, value: float) -> Theta:
 
 
 def _along(score: Scorer, key: Key, others: Theta, windows: np.ndarray, dt: float) -> Callable[[float], float]:
-    """Return the cost as a function of one parameter, the others held."""
     return lambda value: profile_cost(score, _with(score, others, key, value), windows, dt)
 
 
@@ -159,7 +158,6 @@ def at_one_part(
 
 
 def _limits(score: Scorer, key: Key) -> tuple[float, float]:
-    """Return the ends of a parameter's tolerance."""
     p = score.replayer.machine.tolerances.param(key)
     return max(p.low, p.null - p.tolerance), min(p.high, p.null + p.tolerance)
 

@@ -33,8 +33,7 @@ from go1exp.sim.effects.base import Param
 from go1exp.sim.effects.tolerances import Tolerances, effect_class
 from go1exp.sim.task import parse_parts
 
-ROBOT = "robot"
-"""Key of a value that belongs to no joint."""
+ROBOT = "robot"  # key of a value that belongs to no joint
 
 Values = Mapping[str, Mapping[str, Mapping[str, float]]]
 """Effect -> parameter -> joint or ``robot`` -> value."""
@@ -212,7 +211,6 @@ def _reported(result: GapResult) -> float:
 def _same_search(
     recordings: Sequence[Recording], settings: GapSettings, result: GapResult, tolerances: Tolerances
 ) -> None:
-    """Raise a ``GapFileError`` unless a result is of a search in these recordings with these settings."""
     before, now = result.provenance.get("settings", {}), asdict(settings)
     changed = [f"search.{k}" for k in SPLITTING if k in before and before[k] != now[k]]
     if changed:

@@ -289,7 +289,6 @@ def _verdicts(
 
 
 def _same_logs(result: GapResult, recordings: Sequence[Recording]) -> None:
-    """Raise a ``DesignError`` unless a result is of these recordings."""
     logs = result.provenance.get("logs")
     if logs and logs != {r.meta.episode: fingerprint(r) for r in recordings}:
         missing = sorted(set(logs) - {r.meta.episode for r in recordings})

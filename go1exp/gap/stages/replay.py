@@ -215,7 +215,6 @@ Readings = tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, float]]
 
 
 def _measured(comparison: Comparison) -> Readings:
-    """Return what was measured at the windows' sample times."""
     w, recordings = comparison.scorer.windows, comparison.recordings
     clocks = [even_clock(r) for r in recordings]
     rows = [rows_at(clocks[e], begin + t) for e, begin, t in zip(w.episode, w.begin, w.t, strict=True)]

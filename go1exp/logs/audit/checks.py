@@ -20,8 +20,7 @@ from go1exp.logs.audit.report import ORDER, AuditReport, Channel, Finding, worst
 from go1exp.logs.audit.signals import Log, finding
 from go1exp.logs.recording import Recording, problems, read
 
-SHORTEST = 20
-"""Fewest rows of a recording that are checked (chosen: a median step and its spread need about as many)."""
+SHORTEST = 20  # fewest rows of a recording that are checked (chosen: a median step and its spread need about as many)
 
 
 def audit_file(path: Path) -> AuditReport:
@@ -100,7 +99,6 @@ def _run_checks(log: Log) -> tuple[list[Finding], _Measured]:
 
 
 def _channel_table(log: Log, findings: list[Finding], measured: _Measured) -> tuple[Channel, ...]:
-    """One line for each column of the recording."""
     table = []
     for name, values in log.recording.channels.items():
         delay = measured.delays.get(name)
@@ -166,8 +164,7 @@ def _report(
 
 # ---------------------------------------------------------------------- several recordings
 
-EXCEPTION = 3
-"""Times as many recordings that must agree before others are exceptions."""
+EXCEPTION = 3  # times as many recordings that must agree before others are exceptions
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,7 @@ SMOOTH = 0.2
 """s of smoothing: order and sign are checked below about 3 Hz, where a joint follows its target at any gains."""
 LONGEST_LAG = 0.12
 """s by which a joint may trail its target (chosen: longer than the response of any actuator under position control)."""
-LONGEST_TRAIL = 0.3
-"""s; the same for a soft position servo."""
+LONGEST_TRAIL = 0.3  # s; the same for a soft position servo
 
 
 def order_and_sign(log: Log) -> Iterator[Finding]:
@@ -204,12 +203,9 @@ def _trailing(log: Log, joints: list[str]) -> Iterator[Finding]:
 
 # ---------------------------------------------------------------------- delay, without a model of the robot
 
-BLOCKS = 10
-"""Stretches of time for the jackknife."""
-FINE = 2
-"""Points of the search grid to a sample."""
-MOST_ROWS = 1500
-"""Rows of the regression; long recordings are thinned."""
+BLOCKS = 10  # stretches of time for the jackknife
+FINE = 2  # points of the search grid to a sample
+MOST_ROWS = 1500  # rows of the regression; long recordings are thinned
 
 
 @dataclass(frozen=True)

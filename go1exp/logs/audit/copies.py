@@ -6,6 +6,7 @@ Two sensors never agree to the last digit. What was computed from a channel repe
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -23,8 +24,7 @@ MEANING = {
     ("tau_est", "tau_cmd"): COMMANDED,
 }
 """What a copy of the second quantity in a column of the first one means."""
-TAPS = 9
-"""Angles from which a derived speed is sought, its own row in the middle."""
+TAPS = 9  # angles from which a derived speed is sought, its own row in the middle
 
 Prediction = tuple[np.ndarray, float]
 """A channel (T,) computed from an angle, NaN where unknown, and by how much noise of the angle counts in it."""
@@ -33,8 +33,9 @@ Prediction = tuple[np.ndarray, float]
 def copies(log: Log) -> Iterator[Finding]:
     """Find columns that repeat another, speeds that are differences of the angle, and torques that are the PD law."""
     copied = set[str]()
-    for first, second in combinations(log.quantity, 2):
-        for f in _equal(log, *sorted((first, second), key=lambda c: log.quantity[c] not in ("q_target", "tau_est"))):
+    for pair in combinations(log.quantity, 2):
+        # The one that may be a copy comes first.
+        for f in _equal(log, *sorted(pair, key=lambda c: log.quantity[c] not in ("q_target", "tau_est"))):
             copied.add(f.channel)
             yield f
     for joint in log.joints:
@@ -43,61 +44,6 @@ def copies(log: Log) -> Iterator[Finding]:
                 copied.add(name)
                 verdict = _weight(log, (log.quantity[name], ""))
                 yield finding("copy", name, verdict, share, "", f"{message} in {share:.1%} of the rows that change")
-
-
-def _derived(log: Log, joint: str) -> Iterator[tuple[str, float, str]]:
-    """Yield columns of a joint, in which share of the rows each repeats the noise of another, and what that means."""
-    names = [joint_channel(kind, joint) for kind in ("q", "qd", "q_target", "tau_est", "tau_cmd")]
-    q, qd, target, tau, command = (log.recording.channels.get(name) for name in names)
-    one = np.ones((len(log.t), 1))
-    if command is not None and tau is not None and (floor := _floor(log, names[3])):
-        share = _repeated(log, command, [_fitted(command, tau[:, None], one)], floor, tau, 0.0)
-        yield names[3], share, f"is {names[4]} up to a factor ({COMMANDED})"
-    if q is None or not (floor := _floor(log, names[0])):
-        return  # without noise of the angle, what is computed from it looks as if measured
-    if target is not None:
-        share = _repeated(log, target, [_fitted(target, q[:, None], one)], floor, q, 0.0)
-        yield names[2], share, f"is {names[0]} up to a factor and an offset"
-    if qd is not None:
-        share = _repeated(log, qd, _slopes(log.t, q, qd), floor, q, log.steps[names[1]])
-        yield names[1], share, f"was computed from {names[0]}, whose noise it repeats"
-    if tau is not None and target is not None and abs(signals.correlation(q, target)) < limits.ALIKE:
-        others = np.column_stack([target, one, *([] if qd is None else [qd])])
-        laws = [_fitted(np.roll(tau, -late), q[:, None], others) for late in range(limits.LAW_ROWS)]
-        shares = [
-            _repeated(log, np.roll(tau, -late), [law], floor, q, log.steps[names[3]]) for late, law in enumerate(laws)
-        ]
-        yield names[3], max(shares), f"is a linear law of {names[2]} and {names[0]} ({COMMANDED})"
-
-
-def _equal(log: Log, name: str, other: str) -> Iterator[Finding]:
-    """Report columns that are equal in rows where they change; what may be a target or a torque also a row apart."""
-    kinds = log.quantity[name], log.quantity[other]
-    if "t" in kinds or (kinds[0] == kinds[1] and kinds[0] in COMMANDS) or any(k.startswith("base_") for k in kinds):
-        return  # joints may have one command, and a simulator's truth may be its reading
-    ideal = not all(_floor(log, c) for c in (name, other) if log.quantity[c] not in COMMANDS)
-    if ideal and kinds not in MEANING:
-        return
-    a, b = (log.recording.channels[c].astype(float) for c in (name, other))
-    span, related = float(min(np.ptp(a), np.ptp(b))), kinds in MEANING
-    rounding = 0.51 * max(log.steps.get(c, 0.0) for c in (name, other)) if related else 0.0
-    close = min(max(rounding, 1e-6 * span), 2e-3 * span)
-    part = slice(1, -1, max(1, len(a) // limits.COPY_ROWS))
-    for late in (0, 1, -1) if related else (0,):
-        moved = np.roll(b, late)
-        if np.mean(np.abs(a[part] - moved[part]) <= close) < limits.COPIED / 2:
-            continue  # most pairs, by a part of their rows
-        each = [np.append(False, np.diff(x) != 0.0) for x in (a, moved)]
-        either, both = (each[0] | each[1]) & log.on, each[0] & each[1] & log.on
-        same = both & (np.abs(a - moved) <= close)
-        share = float(same.sum() / max(1, either.sum()))
-        if share > limits.COPIED and same.sum() >= limits.ENOUGH * (1.0 if share < limits.DERIVED else 0.2):
-            row = f" of the row {'before' if late > 0 else 'after'}" if late else ""
-            why = MEANING.get(kinds, "one of the two holds another quantity")
-            message = f"equals {other}{row} in {share:.1%} of the rows in which they change: {why}"
-            ideal_drive = ideal and kinds == ("tau_est", "tau_cmd")
-            yield finding("copy", name, "ok" if ideal_drive else _weight(log, kinds), share, "", message)
-            return
 
 
 def _weight(log: Log, kinds: tuple[str, str]) -> Verdict:
@@ -110,6 +56,101 @@ def _floor(log: Log, channel: str) -> float:
     """Return the noise of a measured column with its quantisation; 0 in an ideal simulation."""
     floor = float(np.hypot(log.noise(channel), log.steps[channel] / np.sqrt(12.0)))
     return floor if floor > limits.IDEAL * float(np.ptp(log.recording.channels[channel])) else 0.0
+
+
+# ---------------------------------------------------------------------- equal columns
+
+
+def _equal(log: Log, name: str, other: str) -> Iterator[Finding]:
+    """Report columns that are equal in rows where they change; what may be a target or a torque also a row apart."""
+    kinds = log.quantity[name], log.quantity[other]
+    if "t" in kinds or (kinds[0] == kinds[1] and kinds[0] in COMMANDS) or any(k.startswith("base_") for k in kinds):
+        return  # joints may have one command, and a simulator's truth may be its reading
+    related = kinds in MEANING
+    ideal = not all(_floor(log, c) for c in (name, other) if log.quantity[c] not in COMMANDS)
+    if ideal and not related:
+        return
+    a, b = (log.recording.channels[c].astype(float) for c in (name, other))
+    span = float(min(np.ptp(a), np.ptp(b)))
+    rounding = 0.51 * max(log.steps.get(c, 0.0) for c in (name, other)) if related else 0.0
+    close = min(max(rounding, 1e-6 * span), 2e-3 * span)
+    for late in (0, 1, -1) if related else (0,):
+        share, count = _shared(a, np.roll(b, late), log.on, close)
+        if share > limits.COPIED and count >= limits.ENOUGH * (1.0 if share < limits.DERIVED else 0.2):
+            row = f" of the row {'before' if late > 0 else 'after'}" if late else ""
+            why = MEANING.get(kinds, "one of the two holds another quantity")
+            message = f"equals {other}{row} in {share:.1%} of the rows in which they change: {why}"
+            verdict = "ok" if ideal and kinds == ("tau_est", "tau_cmd") else _weight(log, kinds)
+            yield finding("copy", name, verdict, share, "", message)
+            return
+
+
+def _shared(a: np.ndarray, b: np.ndarray, on: np.ndarray, close: float) -> tuple[float, int]:
+    """Return the share, and the number, of the ``on`` rows (T,) where two columns change to values that are close."""
+    part = slice(1, -1, max(1, len(a) // limits.COPY_ROWS))
+    if np.mean(np.abs(a[part] - b[part]) <= close) < limits.COPIED / 2:
+        return 0.0, 0  # most pairs, by a part of their rows
+    changes, other = (np.append(False, np.diff(x) != 0.0) & on for x in (a, b))
+    count = int((changes & other & (np.abs(a - b) <= close)).sum())
+    return count / max(1, int((changes | other).sum())), count
+
+
+# ---------------------------------------------------------------------- columns computed from another
+
+
+@dataclass(frozen=True)
+class _Source:
+    """A channel ``x`` (T,) from which others may have been computed, its noise, and the rows (T,) in which it changes.
+
+    Without noise there is nothing to look for: what is computed from it looks as if measured.
+    """
+
+    x: np.ndarray
+    noise: float
+    rows: np.ndarray
+
+    @staticmethod
+    def from_log(log: Log, channel: str) -> _Source:
+        x = log.recording.channels[channel]
+        return _Source(x, _floor(log, channel), np.append(False, np.diff(x) != 0.0) & log.on)
+
+    def repeated(self, y: np.ndarray, predictions: Iterable[Prediction], step: float = 0.0) -> float:
+        """Return in which share of rows ``y`` (T,) is nearer to a prediction than the noise in it allows.
+
+        The best prediction counts; ``step`` is the quantisation of ``y``.
+        """
+        shares = [0.0]
+        for predicted, gain in predictions:
+            whole, noise = np.isfinite(predicted), self.noise * gain
+            known = self.rows & whole
+            close = max(limits.SAME_NOISE * noise, 0.51 * step if step < noise else 0.0)
+            as_rough = _roughness(y[whole]) > 0.5 * _roughness(predicted[whole])  # otherwise the noise is not in y
+            if known.sum() >= limits.ENOUGH and np.ptp(y[known]) > 0.0 and as_rough:
+                shares.append(float(np.mean(np.abs(y[known] - predicted[known]) < close)))
+        return max(shares)
+
+
+def _derived(log: Log, joint: str) -> Iterator[tuple[str, float, str]]:
+    """Yield columns of a joint, in which share of the rows each repeats the noise of another, and what that means."""
+    names = [joint_channel(kind, joint) for kind in ("q", "qd", "q_target", "tau_est", "tau_cmd")]
+    q, qd, target, tau, command = (log.recording.channels.get(name) for name in names)
+    one = np.ones((len(log.t), 1))
+    if command is not None and tau is not None and (torque := _Source.from_log(log, names[3])).noise:
+        share = torque.repeated(command, [_fitted(command, tau[:, None], one)])
+        yield names[3], share, f"is {names[4]} up to a factor ({COMMANDED})"
+    if q is None or not (angle := _Source.from_log(log, names[0])).noise:
+        return
+    if target is not None:
+        share = angle.repeated(target, [_fitted(target, q[:, None], one)])
+        yield names[2], share, f"is {names[0]} up to a factor and an offset"
+    if qd is not None:
+        share = angle.repeated(qd, _slopes(log.t, q, qd), log.steps[names[1]])
+        yield names[1], share, f"was computed from {names[0]}, whose noise it repeats"
+    if tau is not None and target is not None and abs(signals.correlation(q, target)) < limits.ALIKE:
+        others = np.column_stack([target, one, *([] if qd is None else [qd])])
+        sooner = [np.roll(tau, -late) for late in range(limits.LAW_ROWS)]
+        shares = [angle.repeated(y, [_fitted(y, q[:, None], others)], log.steps[names[3]]) for y in sooner]
+        yield names[3], max(shares), f"is a linear law of {names[2]} and {names[0]} ({COMMANDED})"
 
 
 def _fitted(y: np.ndarray, angles: np.ndarray, others: np.ndarray) -> Prediction:
@@ -136,31 +177,6 @@ def _slopes(t: np.ndarray, q: np.ndarray, qd: np.ndarray) -> Iterator[Prediction
     around = np.full((len(q), TAPS), np.nan)
     around[half:-half] = sliding_window_view(q, TAPS)
     yield _fitted(qd, around, np.column_stack([np.ones(len(q)), np.append(0.0, qd[:-1])]))
-
-
-def _repeated(
-    log: Log, y: np.ndarray, predictions: Iterable[Prediction], floor: float, source: np.ndarray, step: float
-) -> float:
-    """Return in which share of rows ``y`` (T,) is nearer to a prediction than the noise of its source allows.
-
-    Args:
-        log: of the channels.
-        y: channel (T,).
-        predictions: from ``source``; the best one counts.
-        floor: noise of ``source``.
-        source: channel (T,) from which ``y`` may have been computed; rows count in which it changes.
-        step: quantisation of ``y``.
-    """
-    rows = np.append(False, np.diff(source) != 0.0) & log.on
-    shares = [0.0]
-    for predicted, gain in predictions:
-        whole, noise = np.isfinite(predicted), floor * gain
-        known = rows & whole
-        close = max(limits.SAME_NOISE * noise, 0.51 * step if step < noise else 0.0)
-        as_rough = _roughness(y[whole]) > 0.5 * _roughness(predicted[whole])  # otherwise the noise is not in y
-        if known.sum() >= limits.ENOUGH and np.ptp(y[known]) > 0.0 and as_rough:
-            shares.append(float(np.mean(np.abs(y[known] - predicted[known]) < close)))
-    return max(shares)
 
 
 def _roughness(x: np.ndarray) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,14 +11,16 @@ import go1exp.logs.audit.limits as limits
 import go1exp.logs.audit.signals as signals
 from go1exp.logs.audit.report import Finding
 from go1exp.logs.audit.signals import finding
-from go1exp.logs.recording import JOINT_QUANTITIES, VECTORS, Recording, joint_channels
+from go1exp.logs.recording import VECTORS, Recording, joint_channels
 from go1exp.robot import JOINTS, VELOCITY_LIMIT
 
-SHOWN = 5
-"""Rows that a message lists."""
+SHOWN = 5  # rows that a message lists
+ZEROS = "are zeros between values far from zero"  # what is wrong with rows that a logger filled
 
-ZEROS = "are zeros between values far from zero"
-"""What is wrong with rows that a logger filled."""
+SPIKES = "are spikes that the readings before and after rule out"
+
+Wrong = tuple[str, np.ndarray, str]
+"""Channel, rows (T,) bool that cannot be right, of which there may be none, and what is wrong with them."""
 
 
 @dataclass(frozen=True)
@@ -32,15 +34,13 @@ class Impossible:
 def impossible(recording: Recording) -> Impossible:
     """Find samples that no motion explains, in a recording whose clock increases and whose values are finite."""
     rows, findings = np.zeros(len(recording.t), dtype=bool), []
-    if len(rows) >= limits.ENOUGH:
-        for channel, wrong, what in _wrong(recording):
+    for channel, wrong, what in _wrong(recording) if len(rows) >= limits.ENOUGH else ():
+        if wrong.any():
             rows |= wrong
-            share = float(wrong.mean())
-            which = np.flatnonzero(wrong)
-            listed = ", ".join(map(str, which[:SHOWN])) + (
-                f" and {len(which) - SHOWN} more" if len(which) > SHOWN else ""
-            )
-            message = f"{len(which)} of {len(rows)} rows ({share:.2%}) {what}; rows from 0: {listed}"
+            share, which = float(wrong.mean()), np.flatnonzero(wrong)
+            rest = f" and {len(which) - SHOWN} more" if len(which) > SHOWN else ""
+            message = f"{len(which)} of {len(rows)} rows ({share:.2%}) {what}; rows from 0: "
+            message += ", ".join(map(str, which[:SHOWN])) + rest
             findings.append(finding("impossible", channel, "bad", share, "", message))
     return Impossible(rows, tuple(findings))
 
@@ -52,49 +52,66 @@ def without(recording: Recording, rows: np.ndarray) -> Recording:
     return Recording(meta, {name: values[~rows] for name, values in recording.channels.items()})
 
 
-def _wrong(recording: Recording) -> Iterator[tuple[str, np.ndarray, str]]:
-    """Yield channel, rows (T,) bool, and what is wrong with them."""
-    names = {q: joint_channels(q, recording.meta.joints) for q in JOINT_QUANTITIES if q not in ("q_target", "tau_cmd")}
-    names |= {q: list(VECTORS[q]) for q in ("imu_gyro", "imu_acc")}
-    t = recording.t
-    for quantity, columns in names.items():
-        if not set(columns) <= set(recording.channels):
-            continue
-        values = recording.block(*columns)
-        zeros = _zeros(t, values, at_ends=quantity == "q")
-        if quantity == "qd":  # a coarse encoder at rest reads zero, too
-            slope = np.gradient(recording.joint("q"), t, axis=0) if recording.has("q") else np.zeros_like(values)
-            zeros &= np.any(np.abs(slope) > limits.TURNS, axis=1)
-        elif quantity == "tau_est":  # of actuators that are off
-            zeros &= False
-        if zeros.any():
-            yield (columns[0] if len(columns) == 1 else quantity), zeros, ZEROS
-        lone = np.zeros(values.shape, dtype=bool)
-        if quantity == "q":  # spikes first: one that is left by an ordinary step would part what follows from the rest
-            lone = np.stack([_lone_zeros(x, ~zeros) for x in values.T], axis=1)
-            out = np.stack([_outliers(t, x, ~zeros & ~lost) for x, lost in zip(values.T, lone.T, strict=True)], axis=1)
-            sound = ~zeros & ~lone.any(axis=1) & ~out.any(axis=1)
-        for k, name in enumerate(columns):
-            if lone[:, k].any():
-                yield name, lone[:, k], ZEROS
-            if quantity == "q":
-                jumps = np.zeros(len(t), dtype=bool)
-                jumps[sound] = _jumps(t[sound], values[sound, k], _fastest(recording, k))
-                if jumps.any():
-                    speed = np.abs(np.diff(values[:, k]) / np.diff(t)).max()
-                    yield name, jumps, f"are apart from the others by jumps, at up to {speed:.3g} rad/s"
-                wrong = out[:, k]
-            elif quantity == "qd" and recording.has("q"):
-                wrong = _spikes(t, values[:, k], limits.REVERSED) | _alone(t, values[:, k])
-                slope = np.gradient(recording.joint("q")[:, k], t)
-                wrong &= np.abs(values[:, k] - slope) > 0.7 * _returned(values[:, k])
-            else:
-                span = max(float(np.ptp(np.quantile(values[:, k], (0.005, 0.995)))), 1e-9)
-                far = np.abs(values[:, k] - np.median(values[:, k])) / span
-                wrong = (far > limits.SPANS) & _spikes(t, values[:, k], 0.0) | (far > 2.0) & _alone(t, values[:, k])
-            wrong = wrong & ~zeros & ~lone[:, k]
-            if wrong.any():
-                yield name, wrong, "are spikes that the readings before and after rule out"
+# ---------------------------------------------------------------------- quantity by quantity
+
+
+def _wrong(recording: Recording) -> Iterator[Wrong]:
+    t, joints = recording.t, recording.meta.joints
+    angles = recording.joint("q") if recording.has("q") else None
+    if angles is not None:
+        yield from _wrong_angles(recording, angles)
+    if recording.has("qd"):
+        names, speeds = joint_channels("qd", joints), recording.joint("qd")
+        if angles is None:
+            yield from _wrong_readings(t, names, speeds)
+        else:
+            yield from _wrong_speeds(t, names, speeds, np.gradient(angles, t, axis=0))
+    if recording.has("tau_est"):  # zeros are those of actuators that are off
+        yield from _wrong_readings(t, joint_channels("tau_est", joints), recording.joint("tau_est"))
+    for quantity in ("imu_gyro", "imu_acc"):
+        if set(VECTORS[quantity]) <= set(recording.channels):
+            values = recording.block(*VECTORS[quantity])
+            zeros = _zero_rows(t, values)
+            yield quantity, zeros, ZEROS
+            yield from _wrong_readings(t, VECTORS[quantity], values, ~zeros)
+
+
+def _wrong_angles(recording: Recording, q: np.ndarray) -> Iterator[Wrong]:
+    t, names = recording.t, joint_channels("q", recording.meta.joints)
+    zeros = _zero_rows(t, q, at_ends=True)
+    yield names[0] if len(names) == 1 else "q", zeros, ZEROS
+    lost = np.stack([_lone_zeros(x, ~zeros) for x in q.T], axis=1)
+    # Spikes before jumps: one that is left by an ordinary step would part what follows from the rest.
+    spikes = np.stack([_outliers(t, x, ~zeros & ~gone) for x, gone in zip(q.T, lost.T, strict=True)], axis=1)
+    sound = ~zeros & ~lost.any(axis=1) & ~spikes.any(axis=1)
+    for k, name in enumerate(names):
+        yield name, lost[:, k], ZEROS
+        jumps = np.zeros(len(t), dtype=bool)
+        jumps[sound] = _jumps(t[sound], q[sound, k], _fastest(recording, k))
+        speed = np.abs(np.diff(q[:, k]) / np.diff(t)).max()
+        yield name, jumps, f"are apart from the others by jumps, at up to {speed:.3g} rad/s"
+        yield name, spikes[:, k], SPIKES
+
+
+def _wrong_speeds(t: np.ndarray, names: Sequence[str], qd: np.ndarray, slopes: np.ndarray) -> Iterator[Wrong]:
+    """Yield what is wrong with speeds (T, J) beside the ``slopes`` (T, J) of the angles."""
+    turns = np.any(np.abs(slopes) > limits.TURNS, axis=1)
+    zeros = _zero_rows(t, qd) & turns  # a coarse encoder at rest reads zero, too
+    yield names[0] if len(names) == 1 else "qd", zeros, ZEROS
+    for name, x, slope in zip(names, qd.T, slopes.T, strict=True):
+        spikes = (_spikes(t, x, limits.REVERSED) | _alone(t, x)) & (np.abs(x - slope) > 0.7 * _returned(x))
+        yield name, spikes & ~zeros, SPIKES
+
+
+def _wrong_readings(
+    t: np.ndarray, names: Sequence[str], values: np.ndarray, sound: np.ndarray | bool = True
+) -> Iterator[Wrong]:
+    """Yield the ``sound`` rows in which readings (T, K) that may have impacts are far outside their usual range."""
+    for name, x in zip(names, values.T, strict=True):
+        span = max(float(np.ptp(np.quantile(x, (0.005, 0.995)))), 1e-9)
+        far = np.abs(x - np.median(x)) / span
+        spikes = ((far > limits.SPANS) & _spikes(t, x, 0.0)) | ((far > 2.0) & _alone(t, x))
+        yield name, spikes & sound, SPIKES
 
 
 def _fastest(recording: Recording, joint: int) -> float:
@@ -103,6 +120,9 @@ def _fastest(recording: Recording, joint: int) -> float:
     if recording.meta.robot == "go1" and name in JOINTS:
         return 2.0 * VELOCITY_LIMIT[JOINTS.index(name) % 3]
     return limits.FASTEST
+
+
+# ---------------------------------------------------------------------- spikes
 
 
 def _returned(x: np.ndarray) -> np.ndarray:
@@ -176,7 +196,7 @@ def _lone_zeros(x: np.ndarray, sound: np.ndarray) -> np.ndarray:
     return rows
 
 
-def _zeros(t: np.ndarray, values: np.ndarray, at_ends: bool) -> np.ndarray:
+def _zero_rows(t: np.ndarray, values: np.ndarray, at_ends: bool = False) -> np.ndarray:
     """Return rows (T,) bool of ``values`` (T, J) that are exactly 0, entered and left by an unusual jump.
 
     At the ends of a recording one jump is enough for angles. Speeds and torques may begin at zero.

@@ -14,8 +14,7 @@ from go1exp.logs.audit.signals import Log, finding, graded
 from go1exp.logs.recording import VECTORS, joint_channel
 from go1exp.robot import GRAVITY
 
-BLOCKS = 10
-"""Stretches of time for the error of a mean in motion."""
+BLOCKS = 10  # stretches of time for the error of a mean in motion
 
 SPEED_CHECKS = ("scale", "lag", "repeats", "copy")
 """Checks after which a recorded speed is not to be trusted, even if they only call it suspect."""

@@ -13,8 +13,7 @@ import go1exp.logs.audit.limits as limits
 from go1exp.logs.audit.report import Finding, Verdict
 from go1exp.logs.recording import FOOT_FORCE, JOINT_QUANTITIES, VECTORS, Recording, joint_channels
 
-MOST_GAPS = 300
-"""Most gaps in which a step is searched; of more, a part is taken, evenly over their sorted order."""
+MOST_GAPS = 300  # most gaps in which a step is searched; of more, a part is taken, evenly over their sorted order
 
 
 def stretches(flags: np.ndarray) -> list[tuple[int, int]]:

@@ -16,8 +16,7 @@ from go1exp.robot import EFFORT_LIMIT, JOINT_POS_LIMITS, JOINTS, VELOCITY_LIMIT
 
 SMALLER = ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds"))
 """How many of them make a second, and their name."""
-SHORTEST_STEP = 2e-4
-"""s; few logs of joints step by less (5 kHz): with another unit of time, such a step is likely."""
+SHORTEST_STEP = 2e-4  # s; few logs of joints step by less (5 kHz): with another unit of time, such a step is likely
 
 
 def wrong_steps(log: Log) -> str | None:

@@ -105,5 +105,4 @@ def drop(
     return always_on(np.tile(centre, (len(t), 1)), "ground", float(rng.uniform(*height)))
 
 
-HIGHEST_DROP = 0.2
-"""m (chosen): a stiff leg of a Go1 reaches its torque limit at much lower falls."""
+HIGHEST_DROP = 0.2  # m (chosen): a stiff leg of a Go1 reaches its torque limit at much lower falls

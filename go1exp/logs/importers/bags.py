@@ -20,10 +20,8 @@ from go1exp.robot import JOINTS
 
 EXTRA = 'pip install "go1exp[logs]"'
 
-MOSTLY = 0.9
-"""Share of the messages that must have a field for those without it to be left out, not the field (chosen)."""
-HOLE = 1.5
-"""Step, in median ones, from which a message is missing (chosen: between one step and two)."""
+MOSTLY = 0.9  # share of the messages that must have a field for those without it to be left out, not the field (chosen)
+HOLE = 1.5  # step, in median ones, from which a message is missing (chosen: between one step and two)
 
 
 class Decoded(BaseModel):

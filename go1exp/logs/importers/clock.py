@@ -15,8 +15,7 @@ from go1exp.logs.recording import RecordingError
 COARSE = 0.1
 """Share of rows with the time of the row before, from which the clock is rounded; fewer are copies of a row."""
 
-OVERFLOW = (16, 24, 32)
-"""Bits of counters that begin anew at their end."""
+OVERFLOW = (16, 24, 32)  # bits of counters that begin anew at their end
 
 
 def episodes(labels: np.ndarray | None, t: np.ndarray | None, rows: int) -> list[tuple[str, np.ndarray]]:

@@ -20,8 +20,7 @@ from go1exp.logs.importers.source import LEVEL, files, recording, without_repeat
 from go1exp.logs.importers.table import UTF8, Layout, Table, names, read
 from go1exp.logs.recording import FLAG, FOOT_FORCE, JOINT_QUANTITIES, VECTORS, Quaternion, Recording, RecordingError
 
-PATH = "importer.csv"
-"""Where a complaint about an option begins."""
+PATH = "importer.csv"  # where a complaint about an option begins
 
 _TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _ANGLE = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "turn": 2 * np.pi}
@@ -74,7 +73,6 @@ _COLUMN = TypeAdapter(Column)
 
 
 def _is_number(column: object) -> bool:
-    """Return whether a column is given by its number, as in a file without names."""
     return isinstance(column, int) and not isinstance(column, bool)
 
 
@@ -193,7 +191,6 @@ def _recordings(
     drop_repeats: bool,
     layout: Layout,
 ) -> Iterator[Recording]:
-    """Yield the episodes of one file."""
     wanted: dict[str, str] = {}
     for name, source in mapping.items():
         wanted[source.column] = ", ".join(filter(None, (wanted.get(source.column), name)))

@@ -90,8 +90,7 @@ def _design(path: Path) -> str:
 
 # ---------------------------------------- Rhoban/bam, Apache 2.0
 
-MOST_LINES = 3
-"""Most problems of a file that are reported: a missing key is missing in every row."""
+MOST_LINES = 3  # most problems of a file that are reported: a missing key is missing in every row
 
 PENDULUM = "pendulum"
 
@@ -240,10 +239,8 @@ THEIR_JOINTS = tuple(f"{leg}_{kind}" for leg in ("FL", "FR", "RL", "RR") for kin
 
 # ---------------------------------------- mass2010chromium/walk-these-ways, MIT
 
-KP = 20.0
-"""Position gain the source states, N m/rad."""
-KD = 0.5
-"""Velocity gain the source states, N m s/rad."""
+KP = 20.0  # position gain the source states, N m/rad
+KD = 0.5  # velocity gain the source states, N m s/rad
 TORQUE_TOLERANCE = 1e-3
 """Largest difference between the source's PD torque and that of these gains, N m (float32 rounding)."""
 

@@ -18,8 +18,7 @@ from go1exp.robot import JOINTS, LEGS
 PACKAGES = ("unitree_go", "ros2_unitree_legged_msgs", "unitree_legged_msgs")
 """Packages of ROS 2 that have Unitree's messages, of the Go2 first."""
 
-STOP = 1e6
-"""rad; the value by which a command says that it has no target, 2.146e9, lies above it."""
+STOP = 1e6  # rad; the value by which a command says that it has no target, 2.146e9, lies above it
 
 Joints = tuple[int, tuple[Any, ...], tuple[str, ...], Mapping[str, Sequence[float]]]
 """Stamp, ns, source, names and values of a message, as ``bags.Kind`` has them."""
@@ -247,7 +246,6 @@ def _lowstate(
     cut: bool,
     about: Mapping[str, Any],
 ) -> Recording:
-    """Return one log as a recording."""
     topics = {state_topic: STATE} | ({command_topic: COMMAND} if command_topic else {})
     states, notes = bags.read(path, topics, cut)
     for topic, group in states.items():

@@ -16,12 +16,10 @@ from go1exp.robot import GRAVITY
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-LEGS = ("FL", "FR", "RR", "RL")
-"""Legs 1 to 4 of the source; its joints have numbers and no names."""
+LEGS = ("FL", "FR", "RR", "RL")  # legs 1 to 4 of the source; its joints have numbers and no names
 JOINTS = tuple(f"{leg}_{number}" for leg in LEGS for number in (1, 2, 3))
 
-WILD_FORCE = 200.0
-"""N; more than twice the weight of the robot (8.8 kg) on one foot is an error of the sensor (chosen)."""
+WILD_FORCE = 200.0  # N; more than twice the weight of the robot (8.8 kg) on one foot is an error of the sensor (chosen)
 
 NOTES = (
     "The source's joint velocity is 1.5 to 1.7 times the derivative of q and is left out: differentiate q. "

@@ -20,15 +20,11 @@ from go1exp.config.schema.registry import explain
 from go1exp.logs.recording import KEY, Meta, Recording, RecordingError, joint_channels, problems
 from go1exp.robot.go1_fields import TORQUE_NOTE, in_torque_steps
 
-LEVEL = (1.0, 0.0, 0.0, 0.0)
-"""Attitude of an upright base, w-x-y-z."""
-
-RATE_DIGITS = 6
-"""Significant digits of a rate taken from time stamps."""
+LEVEL = (1.0, 0.0, 0.0, 0.0)  # attitude of an upright base, w-x-y-z
+RATE_DIGITS = 6  # significant digits of a rate taken from time stamps
 
 
-RESTART = 0.5
-"""Least share of the time since the last beginning that a clock loses where it begins anew (chosen)."""
+RESTART = 0.5  # least share of the time since the last beginning that a clock loses where it begins anew (chosen)
 MOST_STEPS = 10.0
 """Longest step after that, in median steps (chosen): behind a single wrong stamp the clock leaps ahead."""
 

@@ -21,8 +21,7 @@ from go1exp.logs.recording import RecordingError
 
 UTF8 = "utf-8"
 
-DELIMITERS = ";\t|,"
-"""What may stand between two columns, the most certain sign of it first."""
+DELIMITERS = ";\t|,"  # what may stand between two columns, the most certain sign of it first
 
 WITH_SIGN = {
     ",": re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*"),
@@ -30,8 +29,7 @@ WITH_SIGN = {
 }
 """Decimal sign -> a number that is written with it."""
 
-BLOCK = 2**24
-"""Bytes of a text file that are held at a time; 16 MiB have the types of nearly all columns right."""
+BLOCK = 2**24  # bytes of a text file that are held at a time; 16 MiB have the types of nearly all columns right
 
 UNIT = re.compile(r"\s*([\[(]?[^\W\d_].*|[\[(]?[°%].*|[\[(]?[-1]?[\])]?)\s*")
 """A cell of a line of units: a word, an empty cell, 1 or a dash."""
@@ -267,7 +265,6 @@ def _uneven(path: Path, message: str, layout: Layout) -> str | None:
 
 
 def _missing(path: Path, name: str, what: str, present: Iterable[str]) -> str:
-    """Word the complaint about a column that the file does not have."""
     lower = {other.lower(): other for other in present}
     close = [lower[n] for n in difflib.get_close_matches(name.lower(), lower, n=3, cutoff=0.5)]
     hint = f"did you mean {' or '.join(map(repr, close))}? " if close else ""
@@ -284,7 +281,6 @@ def _no_names(names: Iterable[str], layout: Layout) -> str:
 
 
 def _other_delimiter(text: str, layout: Layout) -> str | None:
-    """Return another delimiter that stands in a text."""
     return next((d for d in DELIMITERS if d != layout.delimiter and d in text), None)
 
 

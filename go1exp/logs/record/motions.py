@@ -22,8 +22,7 @@ from go1exp.robot import JOINTS
 from go1exp.robot.messages import LowCmd, LowState
 from go1exp.sim.task import MANY_TERMS
 
-ROUNDING = 1e-4
-"""Rad by which a target may lie beyond a limit: a file has a few digits."""
+ROUNDING = 1e-4  # rad by which a target may lie beyond a limit: a file has a few digits
 
 
 def written(path: Path) -> dict[str, np.ndarray]:
@@ -112,14 +111,9 @@ def mpc(*_: Any) -> None:
 BLEND_S = 2.0
 """Time in which the robot moves from the nominal stance, where standing up ends, to the first target, s (chosen)."""
 
-RATE_HZ = 400.0
-"""Targets per second of a motion that is no file."""
-
-SECONDS = 20.0
-"""Length of a motion that is no file, if none is given."""
-
-GAINS = (20.0, 0.5)
-"""kp, N m/rad, and kd, N m s/rad, of a motion without gains of its own: those of the paper."""
+RATE_HZ = 400.0  # targets per second of a motion that is no file
+SECONDS = 20.0  # length of a motion that is no file, if none is given
+GAINS = (20.0, 0.5)  # kp, N m/rad, and kd, N m s/rad, of a motion without gains of its own: those of the paper
 
 Gains = tuple[np.ndarray, np.ndarray]
 

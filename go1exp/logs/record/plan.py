@@ -16,12 +16,10 @@ from go1exp.config.schema.registry import STRICT, ConfigError, Gain, Positive, T
 from go1exp.logs.excitations import Motion
 from go1exp.logs.record.sensors import SensorConfig
 
-SOFT_LIMIT = 0.95
-"""Share of the joint ranges that motions may use."""
+SOFT_LIMIT = 0.95  # share of the joint ranges that motions may use
 
 
-MOTION_BYTES = 8 * (1 + robot.NUM_JOINTS)
-"""A row of a motion: its time, and the targets of all joints."""
+MOTION_BYTES = 8 * (1 + robot.NUM_JOINTS)  # A row of a motion: its time, and the targets of all joints
 
 ROW_BYTES = MOTION_BYTES + (4 + 8) * (4 * robot.NUM_JOINTS + 14)
 """Lower bound of a row of a recording: motion, what is true, what the logger writes (measured: 1400 B)."""
@@ -164,5 +162,4 @@ def episodes(terms: Sequence[Term], config: RecordingConfig) -> list[Episode]:
 
 
 def _seed(config: RecordingConfig, index: int) -> int:
-    """Return a seed for the noise of one recording."""
     return int(np.random.SeedSequence([config.seed, index]).generate_state(1)[0])

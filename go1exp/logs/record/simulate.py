@@ -32,8 +32,7 @@ from go1exp.sim.physics.scene import build_model
 from go1exp.sim.task import TaskConfig, time_rules
 from go1exp.sim.terrain import TerrainConfig, build_terrain
 
-SETTLE_S = 1.0
-"""Time for which the first target is held before the recording begins, s (not before a drop)."""
+SETTLE_S = 1.0  # time for which the first target is held before the recording begins, s (not before a drop)
 
 Progress = Callable[[int, int], None]
 
@@ -151,7 +150,6 @@ def play(rig: Rig, episodes: Sequence[Episode], sensors: SensorConfig, seed: int
 def _play_together(
     rig: Rig, episodes: Sequence[Episode], sensors: SensorConfig, seed: int, on_step: Progress
 ) -> list[Recording]:
-    """Simulate episodes that share a base."""
     plant = _build_plant(rig, episodes, seed)
     _put_down(plant, episodes, rig.physics_dt)
     per_sample = round(1.0 / (sensors.rate_hz * rig.physics_dt))
@@ -162,7 +160,6 @@ def _play_together(
 
 
 def _build_plant(rig: Rig, episodes: Sequence[Episode], seed: int) -> Plant:
-    """Build one robot for each episode, with the gains of that episode."""
     n, hang = len(episodes), episodes[0].hang
     model, blocks = build_model(
         rig.robot,
@@ -231,7 +228,6 @@ def _follow_motions(
 
 
 def _recording(rig: Rig, sensors: SensorConfig, episode: Episode, true: Mapping[str, np.ndarray]) -> Recording:
-    """Return the recording of one robot."""
     return Recording(
         meta(
             rig.robot,
