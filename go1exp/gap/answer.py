@@ -39,23 +39,14 @@ def not_excited(signal: Mapping[str, float], held: bool = True) -> dict[str, str
 
 @dataclass(frozen=True)
 class Answer:
-    """What a search comes to.
+    """What a search comes to."""
 
-    Attributes:
-        verdict: one of six.
-        named: effects that the data ask for, strongest first.
-        theta: values of the model with them.
-        excess: as in :class:`~go1exp.gap.result.GapResult`.
-        closed: share of the held-out excess that the named effects removed; NaN without one.
-        within: share of the held-out windows within what the user accepts; NaN if nothing is accepted.
-    """
-
-    verdict: Verdict
-    named: tuple[NamedEffect, ...]
-    theta: Theta
-    excess: dict[str, float]
-    closed: float
-    within: float = math.nan
+    verdict: Verdict  # one of six
+    named: tuple[NamedEffect, ...]  # effects that the data ask for, strongest first
+    theta: Theta  # values of the model with them
+    excess: dict[str, float]  # as in :class:`~go1exp.gap.result.GapResult`
+    closed: float  # share of the held-out excess that the named effects removed; NaN without one
+    within: float = math.nan  # share of the held-out windows within what the user accepts; NaN if nothing is accepted
 
 
 def concluded(search: Search, warnings: list[str]) -> tuple[Search, Answer]:

@@ -33,29 +33,17 @@ EDGE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """R rows of some episodes and joints.
+    """R rows of some episodes and joints."""
 
-    Attributes:
-        x: features ``(R, F)``.
-        y: target torque ``(R,)``, N m.
-        joint: index of the joint ``(R,)``.
-        episode: index in the list of recordings ``(R,)``.
-        t: time stamp ``(R,)``, s.
-        speed: joint velocity ``(R,)``, rad/s; NaN where it was not recorded.
-        since_reversal: time to the nearest change of the velocity's sign ``(R,)``, s; inf where there is none.
-        command: the command as a torque ``(R,)``, N m: ``tau_cmd``, else kp e; NaN where neither is known.
-        pd: kp e - kd qd ``(R,)``, N m; NaN where gains or channels are unknown.
-    """
-
-    x: np.ndarray
-    y: np.ndarray
-    joint: np.ndarray
-    episode: np.ndarray
-    t: np.ndarray
-    speed: np.ndarray
-    since_reversal: np.ndarray
-    command: np.ndarray
-    pd: np.ndarray
+    x: np.ndarray  # features ``(R, F)``
+    y: np.ndarray  # target torque ``(R,)``, N m
+    joint: np.ndarray  # index of the joint ``(R,)``
+    episode: np.ndarray  # index in the list of recordings ``(R,)``
+    t: np.ndarray  # time stamp ``(R,)``, s
+    speed: np.ndarray  # joint velocity ``(R,)``, rad/s; NaN where it was not recorded
+    since_reversal: np.ndarray  # time to the nearest change of the velocity's sign ``(R,)``, s; inf where there is none
+    command: np.ndarray  # the command as a torque ``(R,)``, N m: ``tau_cmd``, else kp e; NaN where neither is known
+    pd: np.ndarray  # kp e - kd qd ``(R,)``, N m; NaN where gains or channels are unknown
 
     def __len__(self) -> int:
         return len(self.y)

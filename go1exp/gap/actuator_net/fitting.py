@@ -37,23 +37,14 @@ SLACK = 0.9
 
 @dataclass(frozen=True, eq=False)
 class FitResult:
-    """The result of a fit.
+    """The result of a fit."""
 
-    Attributes:
-        net: the network.
-        report: errors of the network and of the references on the held-out episodes.
-        rows: the held-out rows; ``rows.episode`` indexes ``episodes``.
-        episodes: names of all episodes.
-        torque: model -> torque at ``rows`` ``(R,)``, N m: ``net`` and the available references.
-        curves: group -> (epochs, 2) root mean square errors of training and validation, N m.
-    """
-
-    net: ActuatorNet
-    report: Report
-    rows: Rows
-    episodes: tuple[str, ...]
-    torque: dict[str, np.ndarray]
-    curves: dict[str, np.ndarray]
+    net: ActuatorNet  # the network
+    report: Report  # errors of the network and of the references on the held-out episodes
+    rows: Rows  # the held-out rows; ``rows.episode`` indexes ``episodes``
+    episodes: tuple[str, ...]  # names of all episodes
+    torque: dict[str, np.ndarray]  # model -> torque at ``rows`` ``(R,)``, N m: ``net`` and the available references
+    curves: dict[str, np.ndarray]  # group -> (epochs, 2) root mean square errors of training and validation, N m
 
 
 def fit(

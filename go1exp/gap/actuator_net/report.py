@@ -115,44 +115,26 @@ def linear(train: Rows, train_group: np.ndarray, rows: Rows, group: np.ndarray) 
 
 @dataclass(frozen=True)
 class Cell:
-    """Errors on the rows of one joint (or ``all``), regime and episode (or ``all``).
+    """Errors on the rows of one joint (or ``all``), regime and episode (or ``all``)."""
 
-    Attributes:
-        joint: its name.
-        regime: its name.
-        episode: its name.
-        rows: number of rows.
-        rms: root mean square of the target itself, N m.
-        rmse: model -> root mean square error, N m; ``net`` and the available references.
-    """
-
-    joint: str
-    regime: str
-    episode: str
-    rows: int
-    rms: float
-    rmse: dict[str, float]
+    joint: str  # its name
+    regime: str  # its name
+    episode: str  # its name
+    rows: int  # number of rows
+    rms: float  # root mean square of the target itself, N m
+    rmse: dict[str, float]  # model -> root mean square error, N m; ``net`` and the available references
 
 
 @dataclass(frozen=True)
 class Report:
-    """Errors on the held-out episodes.
+    """Errors on the held-out episodes."""
 
-    Attributes:
-        target: predicted quantity, ``tau_est`` or ``joint_torque``.
-        split: which episodes trained, validated and were held out.
-        cells: one for each joint and for all, in each regime that occurs, over all held-out episodes.
-        episodes: one for each joint and held-out episode, in the regime ``all``.
-        missing: unavailable reference -> reason.
-        thresholds: limits of the regimes.
-    """
-
-    target: str
-    split: Split
-    cells: tuple[Cell, ...]
-    episodes: tuple[Cell, ...]
-    missing: dict[str, str]
-    thresholds: tuple[Thresholds, ...]
+    target: str  # predicted quantity, ``tau_est`` or ``joint_torque``
+    split: Split  # which episodes trained, validated and were held out
+    cells: tuple[Cell, ...]  # one for each joint and for all, in each regime that occurs, over all held-out episodes
+    episodes: tuple[Cell, ...]  # one for each joint and held-out episode, in the regime ``all``
+    missing: dict[str, str]  # unavailable reference -> reason
+    thresholds: tuple[Thresholds, ...]  # limits of the regimes
 
     def cell(self, joint: str = "all", regime: str = "all") -> Cell:
         """Return a cell over all held-out episodes; KeyError without rows of that joint and regime."""

@@ -25,29 +25,17 @@ equal; without a penalty their weights become large and opposite, and amplify no
 
 @dataclass(frozen=True, eq=False)
 class Trained:
-    """One trained network: the arrays of ``ActuatorNet`` without the leading axis K.
+    """One trained network: the arrays of ``ActuatorNet`` without the leading axis K."""
 
-    Attributes:
-        weights: layer by layer (in, out).
-        biases: layer by layer (out,).
-        skip: linear map (F,); zeros without one.
-        input_mean: (F,).
-        input_std: (F,).
-        output_mean: N m.
-        output_std: N m.
-        curve: (epochs done, 2) root mean square errors of training and validation, N m.
-        best: epoch (from 0) whose weights these are.
-    """
-
-    weights: tuple[np.ndarray, ...]
-    biases: tuple[np.ndarray, ...]
-    skip: np.ndarray
-    input_mean: np.ndarray
-    input_std: np.ndarray
-    output_mean: float
-    output_std: float
-    curve: np.ndarray
-    best: int
+    weights: tuple[np.ndarray, ...]  # layer by layer (in, out)
+    biases: tuple[np.ndarray, ...]  # layer by layer (out,)
+    skip: np.ndarray  # linear map (F,); zeros without one
+    input_mean: np.ndarray  # (F,)
+    input_std: np.ndarray  # (F,)
+    output_mean: float  # N m
+    output_std: float  # N m
+    curve: np.ndarray  # (epochs done, 2) root mean square errors of training and validation, N m
+    best: int  # epoch (from 0) whose weights these are
 
 
 def train(

@@ -123,19 +123,12 @@ def bridged(t: np.ndarray, target: np.ndarray, period: float) -> tuple[np.ndarra
 
 @dataclass(frozen=True)
 class Place:
-    """Where a window may be, by the clock of its recording.
+    """Where a window may be, by the clock of its recording."""
 
-    Attributes:
-        first: earliest time at which it may begin, s.
-        last: latest time, s.
-        end: time after which nothing is compared, s.
-        joints: which are compared; all if None.
-    """
-
-    first: float
-    last: float
-    end: float = np.inf
-    joints: tuple[int, ...] | None = None
+    first: float  # earliest time at which it may begin, s
+    last: float  # latest time, s
+    end: float = np.inf  # time after which nothing is compared, s
+    joints: tuple[int, ...] | None = None  # which are compared; all if None
 
     def compared(self, count: int) -> np.ndarray:
         """Return which of ``count`` joints are compared, (J,) bool."""

@@ -32,21 +32,13 @@ TELLING = ("delay", "torque")  # checks of the audit that a missing effect may f
 
 @dataclass(frozen=True)
 class Ready:
-    """Recordings that can be compared with a robot.
+    """Recordings that can be compared with a robot."""
 
-    Attributes:
-        recordings: in the robot's order of joints, with gains, commands and speeds.
-        settings: with windows that suit the robot, as far apart as their number asks.
-        ignored: quantities that are present and not compared.
-        warnings: what was chosen, a sentence each.
-        impossible: rows that were left out since their neighbours rule them out.
-    """
-
-    recordings: tuple[Recording, ...]
-    settings: GapSettings
-    ignored: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
-    impossible: int = 0
+    recordings: tuple[Recording, ...]  # in the robot's order of joints, with gains, commands and speeds
+    settings: GapSettings  # with windows that suit the robot, as far apart as their number asks
+    ignored: tuple[str, ...] = ()  # quantities that are present and not compared
+    warnings: tuple[str, ...] = ()  # what was chosen, a sentence each
+    impossible: int = 0  # rows that were left out since their neighbours rule them out
 
 
 def clock_of_speeds(t: np.ndarray, q: np.ndarray, qd: np.ndarray) -> np.ndarray:

@@ -61,19 +61,12 @@ class Log:
 
 @dataclass(frozen=True)
 class Base:
-    """An estimate of the base.
+    """An estimate of the base."""
 
-    Attributes:
-        state: (13,) as in ``StandingWindows``.
-        loaded: (4,) which feet carry weight.
-        spread: how far those disagree about the base's height, m; infinite with fewer than two.
-        slide: how far they disagree about its velocity, m/s.
-    """
-
-    state: np.ndarray
-    loaded: np.ndarray
-    spread: float
-    slide: float
+    state: np.ndarray  # (13,) as in ``StandingWindows``
+    loaded: np.ndarray  # (4,) which feet carry weight
+    spread: float  # how far those disagree about the base's height, m; infinite with fewer than two
+    slide: float  # how far they disagree about its velocity, m/s
 
 
 def loaded(legs: Legs, log: Log) -> np.ndarray:
@@ -141,21 +134,14 @@ AXES = ("imu_gyro_x", "imu_gyro_y", "imu_gyro_z", "imu_acc_x", "imu_acc_y", "imu
 
 @dataclass(frozen=True)
 class StandingWindows(Windows):
-    """Windows of a standing robot.
+    """Windows of a standing robot."""
 
-    Attributes:
-        base: (W, 13) initial state: position m, attitude w-x-y-z, velocity in the world m/s, rate in the trunk rad/s.
-        sd_of_base: (W, 9) its standard deviations: height, roll and pitch, velocity, rate.
-        contact: (W, n, 4) bool, which feet carry weight.
-        held: (W,) bool, windows of a robot whose trunk is held; their bases mean nothing.
-        imu_site: (3,) where the IMU sits in the trunk, m.
-    """
-
+    # (W, 13) initial state: position m, attitude w-x-y-z, velocity in the world m/s, rate in the trunk rad/s
     base: np.ndarray
-    sd_of_base: np.ndarray
-    contact: np.ndarray
-    held: np.ndarray
-    imu_site: np.ndarray
+    sd_of_base: np.ndarray  # (W, 9) its standard deviations: height, roll and pitch, velocity, rate
+    contact: np.ndarray  # (W, n, 4) bool, which feet carry weight
+    held: np.ndarray  # (W,) bool, windows of a robot whose trunk is held; their bases mean nothing
+    imu_site: np.ndarray  # (3,) where the IMU sits in the trunk, m
 
     @property
     def of_joints(self) -> int:

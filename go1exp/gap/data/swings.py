@@ -43,19 +43,12 @@ AROUND_S = 0.01  # time before and after a window for which its trunk's motion i
 
 @dataclass(frozen=True)
 class TrunkMotion:
-    """How a trunk moves, in its own axes.
+    """How a trunk moves, in its own axes."""
 
-    Attributes:
-        t: (T,) clock, s.
-        force: (T, 3) specific force at the trunk's origin, m/s2.
-        turn: (T, 3) angular acceleration, rad/s2.
-        rate: (T, 3) angular velocity, rad/s.
-    """
-
-    t: np.ndarray
-    force: np.ndarray
-    turn: np.ndarray
-    rate: np.ndarray
+    t: np.ndarray  # (T,) clock, s
+    force: np.ndarray  # (T, 3) specific force at the trunk's origin, m/s2
+    turn: np.ndarray  # (T, 3) angular acceleration, rad/s2
+    rate: np.ndarray  # (T, 3) angular velocity, rad/s
 
     @staticmethod
     def from_log(log: Log, site: np.ndarray) -> TrunkMotion:
@@ -127,13 +120,10 @@ def places(air: Sequence[tuple[int, float, float]], begin: float, end: float) ->
 
 @dataclass(frozen=True)
 class SwingWindows(Windows):
-    """Windows of legs in swing; the joints of the other legs have infinite noise.
+    """Windows of legs in swing; the joints of the other legs have infinite noise."""
 
-    Attributes:
-        carried: per window, times (K,) since the initial state, and force, angular acceleration and rate (K, 9) of the
-            trunk, as in :class:`TrunkMotion`.
-    """
-
+    # per window, times (K,) since the initial state, and force, angular acceleration and rate (K, 9) of the trunk, as
+    # in :class:`TrunkMotion`
     carried: tuple[tuple[np.ndarray, np.ndarray], ...]
 
     @property

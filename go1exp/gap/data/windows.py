@@ -16,51 +16,30 @@ PAST_S = 0.064
 
 @dataclass(frozen=True)
 class Windows:
-    """W windows of at most n samples of C quantities of J joints; what is missing has weight 0.
+    """W windows of at most n samples of C quantities of J joints; what is missing has weight 0."""
 
-    Attributes:
-        joints: their names.
-        quantities: names of the C quantities.
-        period: the logger's, s.
-        episode: (W,) index of the recording.
-        begin: (W,) time of the initial state by the recording's clock, s.
-        origin: (W,) time at which the recording begins, by the same clock, s.
-        q: (W, J) initial state, rad.
-        qd: (W, J) rad/s.
-        qdd: (W, J) rad/s2.
-        q_sd: (W, J) its standard deviation.
-        qd_sd: (W, J)
-        kp: (W, J) gains.
-        kd: (W, J)
-        t: (W, n) times of the samples since the initial state, s.
-        y: (W, n, C, J) what was measured.
-        scale: (W, C, J) standard deviation of its noise.
-        valid: (W, n) bool.
-        edges: per window, times (E,) since the initial state and targets (E, J) in force from each on.
-        switches: per window, times (E,) and whether the drives are on from each on.
-        length: time to replay, s.
-    """
-
-    joints: tuple[str, ...]
-    quantities: tuple[str, ...]
-    period: float
-    episode: np.ndarray
-    begin: np.ndarray
-    origin: np.ndarray
-    q: np.ndarray
-    qd: np.ndarray
-    qdd: np.ndarray
-    q_sd: np.ndarray
-    qd_sd: np.ndarray
-    kp: np.ndarray
-    kd: np.ndarray
-    t: np.ndarray
-    y: np.ndarray
-    scale: np.ndarray
-    valid: np.ndarray
+    joints: tuple[str, ...]  # their names
+    quantities: tuple[str, ...]  # names of the C quantities
+    period: float  # the logger's, s
+    episode: np.ndarray  # (W,) index of the recording
+    begin: np.ndarray  # (W,) time of the initial state by the recording's clock, s
+    origin: np.ndarray  # (W,) time at which the recording begins, by the same clock, s
+    q: np.ndarray  # (W, J) initial state, rad
+    qd: np.ndarray  # (W, J) rad/s
+    qdd: np.ndarray  # (W, J) rad/s2
+    q_sd: np.ndarray  # (W, J) its standard deviation
+    qd_sd: np.ndarray  # (W, J)
+    kp: np.ndarray  # (W, J) gains
+    kd: np.ndarray  # (W, J)
+    t: np.ndarray  # (W, n) times of the samples since the initial state, s
+    y: np.ndarray  # (W, n, C, J) what was measured
+    scale: np.ndarray  # (W, C, J) standard deviation of its noise
+    valid: np.ndarray  # (W, n) bool
+    # per window, times (E,) since the initial state and targets (E, J) in force from each on
     edges: tuple[tuple[np.ndarray, np.ndarray], ...]
+    # per window, times (E,) and whether the drives are on from each on
     switches: tuple[tuple[np.ndarray, np.ndarray], ...]
-    length: float
+    length: float  # time to replay, s
 
     def __len__(self) -> int:
         return len(self.episode)
@@ -158,21 +137,13 @@ KEPT_EVERY = 5  # of this many stretches of an episode one is kept for the last 
 
 @dataclass(frozen=True)
 class Splits:
-    """Numbers of the windows that models are fitted on, chosen by, and finally confirmed on.
+    """Numbers of the windows that models are fitted on, chosen by, and finally confirmed on."""
 
-    Attributes:
-        train: to fit.
-        select: for held-out tests.
-        confirm: whole episodes, or stretches of them, that nothing is decided on; may be empty.
-        alone: episodes of which some stretches are in ``train`` and some in ``select``.
-        shared: those of them that also lend stretches to ``confirm``.
-    """
-
-    train: np.ndarray
-    select: np.ndarray
-    confirm: np.ndarray
-    alone: tuple[str, ...] = ()
-    shared: tuple[str, ...] = ()
+    train: np.ndarray  # to fit
+    select: np.ndarray  # for held-out tests
+    confirm: np.ndarray  # whole episodes, or stretches of them, that nothing is decided on; may be empty
+    alone: tuple[str, ...] = ()  # episodes of which some stretches are in ``train`` and some in ``select``
+    shared: tuple[str, ...] = ()  # those of them that also lend stretches to ``confirm``
 
     @property
     def evaluated(self) -> np.ndarray:

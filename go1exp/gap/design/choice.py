@@ -27,25 +27,15 @@ NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(5)
 
 @dataclass(frozen=True)
 class Pair:
-    """Two explanations.
+    """Two explanations."""
 
-    Attributes:
-        truth: effect that is taken to be there.
-        rival: effect that might be there in its place; empty for none at all.
-        theta: values of the model with the truth.
-        without: values without it, from which the rival is fitted.
-        terms: effects that may leave their tolerances under the rival, itself included.
-        spread: standard deviation of the truth's size, as a share of it.
-        same: mean difference of log chi2 that counts as none (``significance.same``).
-    """
-
-    truth: str
-    rival: str
-    theta: Theta
-    without: Theta
-    terms: tuple[str, ...]
-    spread: float
-    same: float
+    truth: str  # effect that is taken to be there
+    rival: str  # effect that might be there in its place; empty for none at all
+    theta: Theta  # values of the model with the truth
+    without: Theta  # values without it, from which the rival is fitted
+    terms: tuple[str, ...]  # effects that may leave their tolerances under the rival, itself included
+    spread: float  # standard deviation of the truth's size, as a share of it
+    same: float  # mean difference of log chi2 that counts as none (``significance.same``)
 
     @property
     def name(self) -> str:
@@ -55,21 +45,13 @@ class Pair:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What some recordings say about a pair.
+    """What some recordings say about a pair."""
 
-    Attributes:
-        grams: (V, G, p+1, p+1) of the rival's columns, and of what it leaves of the truth.
-        size: (V,) values in a window and group.
-        signal: (V, G) chi2 sum of all that the truth does.
-        weight: how many windows each stands for.
-        episode: (V,) number of the recording.
-    """
-
-    grams: np.ndarray
-    size: np.ndarray
-    signal: np.ndarray
-    weight: float
-    episode: np.ndarray
+    grams: np.ndarray  # (V, G, p+1, p+1) of the rival's columns, and of what it leaves of the truth
+    size: np.ndarray  # (V,) values in a window and group
+    signal: np.ndarray  # (V, G) chi2 sum of all that the truth does
+    weight: float  # how many windows each stands for
+    episode: np.ndarray  # (V,) number of the recording
 
     def one(self, episode: int, weight: float = 1.0) -> Evidence:
         """Return that of one recording, each of whose windows stands for ``weight``."""
@@ -79,19 +61,12 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Worth:
-    """How well recordings separate a pair.
+    """How well recordings separate a pair."""
 
-    Attributes:
-        distance: T, in units of the noise, squared.
-        imitated: share of what the truth does that the rival imitates.
-        gain: mean difference of log chi2 over windows and groups of joints.
-        power: chance that the difference is larger than noise makes it in 1 of 100 cases, and than the search takes
-            for the same.
-    """
-
-    distance: float
-    imitated: float
-    gain: float
+    distance: float  # T, in units of the noise, squared
+    imitated: float  # share of what the truth does that the rival imitates
+    gain: float  # mean difference of log chi2 over windows and groups of joints
+    # chance that the difference is larger than noise makes it in 1 of 100 cases, and than the search takes for the same
     power: float
 
 
@@ -185,21 +160,13 @@ COARSE = 2.0
 
 @dataclass(frozen=True)
 class Choice:
-    """What a search for a design came to.
+    """What a search for a design came to."""
 
-    Attributes:
-        best: the design; None if no pair is distinguishable.
-        worths: of the recordings at hand and the best design together, pair by pair.
-        reach: largest power that any design reached, pair by pair.
-        tried: designs that were looked at.
-        beyond: designs that were left out since they go beyond a limit.
-    """
-
-    best: Rehearsal | None
-    worths: tuple[Worth, ...]
-    reach: tuple[Worth, ...]
-    tried: int
-    beyond: int
+    best: Rehearsal | None  # the design; None if no pair is distinguishable
+    worths: tuple[Worth, ...]  # of the recordings at hand and the best design together, pair by pair
+    reach: tuple[Worth, ...]  # largest power that any design reached, pair by pair
+    tried: int  # designs that were looked at
+    beyond: int  # designs that were left out since they go beyond a limit
 
 
 class _Search:

@@ -100,21 +100,13 @@ class Used:
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of motions.
+    """Limits of motions."""
 
-    Attributes:
-        centre: angles to move about (J,), rad.
-        angle: lowest and highest (J, 2), rad.
-        speed: (J,) rad/s.
-        torque: (J,) N m.
-        power: of all joints together, W.
-    """
-
-    centre: np.ndarray
-    angle: np.ndarray
-    speed: np.ndarray
-    torque: np.ndarray
-    power: float
+    centre: np.ndarray  # angles to move about (J,), rad
+    angle: np.ndarray  # lowest and highest (J, 2), rad
+    speed: np.ndarray  # (J,) rad/s
+    torque: np.ndarray  # (J,) N m
+    power: float  # of all joints together, W
 
     def used(self, q: np.ndarray, qd: np.ndarray, torque: np.ndarray) -> Used:
         """Return how much of the limits a motion uses: angles (T, J), speeds (T, J) and torques (T, J)."""
@@ -185,23 +177,14 @@ class Attitude:
 
 @dataclass(frozen=True)
 class Design:
-    """A recording that could be made.
+    """A recording that could be made."""
 
-    Attributes:
-        excitation: kind of motion.
-        parameters: of the excitation.
-        scale: size of the motion, 1 is the excitation's own.
-        gains: factors on kp and kd of the recordings at hand.
-        attitude: of the base.
-        seed: of the motion.
-    """
-
-    excitation: str
-    parameters: Mapping[str, Any]
-    scale: float
-    gains: tuple[float, float]
-    attitude: Attitude
-    seed: int
+    excitation: str  # kind of motion
+    parameters: Mapping[str, Any]  # of the excitation
+    scale: float  # size of the motion, 1 is the excitation's own
+    gains: tuple[float, float]  # factors on kp and kd of the recordings at hand
+    attitude: Attitude  # of the base
+    seed: int  # of the motion
 
     def term(self, rate_hz: float) -> Term:
         """Return the excitation, its size and band as they are played at a rate of commands, Hz."""

@@ -27,25 +27,15 @@ FADE_S = 1.0  # time at the beginning of a motion that is not evaluated, s: moti
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """A design as the model plays it.
+    """A design as the model plays it."""
 
-    Attributes:
-        design: which.
-        motion: its commands.
-        kp: (J,) N m/rad.
-        kd: (J,) N m s/rad.
-        q: (T, J) angles, rad.
-        qd: (T, J) speeds, rad/s.
-        used: of the limits.
-    """
-
-    design: Design
-    motion: Motion
-    kp: np.ndarray
-    kd: np.ndarray
-    q: np.ndarray
-    qd: np.ndarray
-    used: Used
+    design: Design  # which
+    motion: Motion  # its commands
+    kp: np.ndarray  # (J,) N m/rad
+    kd: np.ndarray  # (J,) N m s/rad
+    q: np.ndarray  # (T, J) angles, rad
+    qd: np.ndarray  # (T, J) speeds, rad/s
+    used: Used  # of the limits
 
 
 @dataclass

@@ -81,23 +81,15 @@ Theta = dict[Key, np.ndarray]
 
 @dataclass(frozen=True)
 class Rows:
-    """R simulations to make.
+    """R simulations to make."""
 
-    Attributes:
-        window: (R,) which window each replays.
-        values: of the effects, (R, J) or (R, 1).
-        q: (R, J) added to the initial angles, rad; None for nothing.
-        qd: (R, J) added to the initial speeds, rad/s.
-        base: (R, 9) added to a free base's first height, roll and pitch, velocity and rate.
-        mount: (R, 10) how far from rest a trunk on a mount begins: by what these forces, N, and torques, N m, along the
-            mount's five directions deflect it, then at the speeds with which it would swing so far.
-    """
-
-    window: np.ndarray
-    values: Mapping[Key, np.ndarray]
-    q: np.ndarray | None = None
-    qd: np.ndarray | None = None
-    base: np.ndarray | None = None
+    window: np.ndarray  # (R,) which window each replays
+    values: Mapping[Key, np.ndarray]  # of the effects, (R, J) or (R, 1)
+    q: np.ndarray | None = None  # (R, J) added to the initial angles, rad; None for nothing
+    qd: np.ndarray | None = None  # (R, J) added to the initial speeds, rad/s
+    base: np.ndarray | None = None  # (R, 9) added to a free base's first height, roll and pitch, velocity and rate
+    # (R, 10) how far from rest a trunk on a mount begins: by what these forces, N, and torques, N m, along the mount's
+    # five directions deflect it, then at the speeds with which it would swing so far
     mount: np.ndarray | None = None
 
     def part(self, which: np.ndarray) -> Rows:
@@ -129,19 +121,12 @@ def null(effect: str, tolerances: Tolerances) -> Theta:
 
 @dataclass(frozen=True)
 class Probe:
-    """One changed simulation beside the unchanged one.
+    """One changed simulation beside the unchanged one."""
 
-    Attributes:
-        key: parameter that is changed, or None for an initial state.
-        place: which joint of each group; None for a parameter of the robot.
-        delta: (J,) or (1,) by how much, per joint.
-        also: other parameters that are set meanwhile (shapes), by key.
-    """
-
-    key: Key | str
-    place: int | None
-    delta: np.ndarray
-    also: Theta = field(default_factory=dict)
+    key: Key | str  # parameter that is changed, or None for an initial state
+    place: int | None  # which joint of each group; None for a parameter of the robot
+    delta: np.ndarray  # (J,) or (1,) by how much, per joint
+    also: Theta = field(default_factory=dict)  # other parameters that are set meanwhile (shapes), by key
 
 
 def variants(

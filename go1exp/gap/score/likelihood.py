@@ -80,28 +80,21 @@ def gram(columns: np.ndarray, state: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Scorer:
-    """Scores replays of windows.
+    """Scores replays of windows."""
 
-    Attributes:
-        replayer: the model.
-        scale: (W, C, J) standard deviation of noise and numerical error.
-        state: (W, G, m, k) change of the readings, in units of ``scale``, per standard deviation of the initial state
-            and of the clock.
-        updated: returns a scorer whose floors and initial states suit other values of the model.
-        clock_s: what the clock was taken to be off by, s.
-        finer: residuals are replayed at this part of the step that columns and floors are measured at.
-        expected: the windows with their initial states as sensors tell them, where those were moved; None if not.
-        common: (k,) bool, which columns of ``state`` are of a trunk on a mount, which all groups feel. In scores each
-            group has it to itself.
-    """
-
-    replayer: Replayer
-    scale: np.ndarray
+    replayer: Replayer  # the model
+    scale: np.ndarray  # (W, C, J) standard deviation of noise and numerical error
+    # (W, G, m, k) change of the readings, in units of ``scale``, per standard deviation of the initial state and of the
+    # clock
     state: np.ndarray
+    # returns a scorer whose floors and initial states suit other values of the model
     updated: Callable[[Theta], Scorer] | None = None
-    clock_s: float = 0.0
+    clock_s: float = 0.0  # what the clock was taken to be off by, s
+    # the windows with their initial states as sensors tell them, where those were moved; None if not
     expected: Windows | None = None
-    finer: int = 1
+    finer: int = 1  # residuals are replayed at this part of the step that columns and floors are measured at
+    # (k,) bool, which columns of ``state`` are of a trunk on a mount, which all groups feel. In scores each group has
+    # it to itself
     common: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     @property

@@ -14,19 +14,13 @@ from go1exp.gap.score.likelihood import Scorer, gram, grouped
 
 @dataclass(frozen=True)
 class Layout:
-    """Which unknown each column of each group belongs to.
+    """Which unknown each column of each group belongs to."""
 
-    Attributes:
-        index: (G, p) unknown of column p in group g: one for each group, but one in all for a parameter of the robot.
-        size: number of unknowns.
-        joint: (size,) joint of each unknown, -1 for the robot.
-        probe: (size,) column of each.
-    """
-
+    # (G, p) unknown of column p in group g: one for each group, but one in all for a parameter of the robot
     index: np.ndarray
-    size: int
-    joint: np.ndarray
-    probe: np.ndarray
+    size: int  # number of unknowns
+    joint: np.ndarray  # (size,) joint of each unknown, -1 for the robot
+    probe: np.ndarray  # (size,) column of each
 
     @staticmethod
     def from_probes(machine: Machine, probes: Sequence[Probe]) -> Layout:
@@ -60,23 +54,14 @@ class Layout:
 
 @dataclass(frozen=True)
 class Table:
-    """A linear model of some windows about ``theta``.
+    """A linear model of some windows about ``theta``."""
 
-    Attributes:
-        windows: (V,) which.
-        probes: the p columns.
-        residual: (V, G, m) in units of the noise.
-        columns: (V, G, m, p) fall of the residual per unit of each parameter.
-        theta: where.
-        scale: (V, C, J) the noise that is the unit.
-    """
-
-    windows: np.ndarray
-    probes: tuple[Probe, ...]
-    residual: np.ndarray
-    columns: np.ndarray
-    theta: Theta
-    scale: np.ndarray
+    windows: np.ndarray  # (V,) which
+    probes: tuple[Probe, ...]  # the p columns
+    residual: np.ndarray  # (V, G, m) in units of the noise
+    columns: np.ndarray  # (V, G, m, p) fall of the residual per unit of each parameter
+    theta: Theta  # where
+    scale: np.ndarray  # (V, C, J) the noise that is the unit
 
     def part(self, which: np.ndarray) -> Table:
         """Return the model of some of the windows (numbers within it)."""

@@ -128,35 +128,20 @@ def unexcited_rows(signal: Mapping[str, float], threshold: float, tested: Sequen
 
 @dataclass(frozen=True)
 class Trial:
-    """Fitted candidates on held-out windows.
+    """Fitted candidates on held-out windows."""
 
-    Attributes:
-        names: of the M candidates.
-        after: their excess.
-        gain: (M, V G) fall of log chi2.
-        p: (M,) of all together.
-        share: (M,) of the excess that is gone.
-        sizes: (M,) in tolerances.
-        needed: share that one must remove.
-        shown: (M,) which are significant.
-        helps: (M,) which are, and remove enough.
-        alias: (M,) which do as well as the best of those that also leave their tolerances.
-        aside: (M,) which do as well too, with more numbers.
-        chosen: the one of these to accept; None if there is none, or if one within its tolerance does as well.
-    """
-
-    names: list[str]
-    after: list[float]
-    gain: np.ndarray
-    p: np.ndarray
-    share: np.ndarray
-    sizes: np.ndarray
-    needed: float
-    shown: np.ndarray
-    helps: np.ndarray
-    alias: np.ndarray
-    aside: np.ndarray
-    chosen: int | None
+    names: list[str]  # of the M candidates
+    after: list[float]  # their excess
+    gain: np.ndarray  # (M, V G) fall of log chi2
+    p: np.ndarray  # (M,) of all together
+    share: np.ndarray  # (M,) of the excess that is gone
+    sizes: np.ndarray  # (M,) in tolerances
+    needed: float  # share that one must remove
+    shown: np.ndarray  # (M,) which are significant
+    helps: np.ndarray  # (M,) which are, and remove enough
+    alias: np.ndarray  # (M,) which do as well as the best of those that also leave their tolerances
+    aside: np.ndarray  # (M,) which do as well too, with more numbers
+    chosen: int | None  # the one of these to accept; None if there is none, or if one within its tolerance does as well
 
     @property
     def mean(self) -> np.ndarray:

@@ -16,23 +16,15 @@ from go1exp.sim.effects.tolerances import Tolerances
 
 @dataclass(frozen=True)
 class Model:
-    """A model to fit or fitted.
+    """A model to fit or fitted."""
 
-    Attributes:
-        name: of the effect that it is about.
-        theta: values.
-        may: what may leave its tolerance.
-        keys: parameters whose columns are refreshed in every step; the rest keep those of the common table.
-        chi2: (V, G) per value, on the windows of the fit.
-        residual: (V, G, m) there, in units of the noise.
-    """
-
-    name: str
-    theta: Theta
-    may: tolerances.Freedom
+    name: str  # of the effect that it is about
+    theta: Theta  # values
+    may: tolerances.Freedom  # what may leave its tolerance
+    # parameters whose columns are refreshed in every step; the rest keep those of the common table
     keys: tuple[Key, ...]
-    chi2: np.ndarray | None = None
-    residual: np.ndarray | None = None
+    chi2: np.ndarray | None = None  # (V, G) per value, on the windows of the fit
+    residual: np.ndarray | None = None  # (V, G, m) there, in units of the noise
 
 
 def stacked(parts: Sequence[Rows], known: Tolerances) -> Rows:

@@ -20,19 +20,13 @@ from go1exp.sim.effects.tolerances import Tolerances, sizes
 
 @dataclass(frozen=True)
 class Variant:
-    """One way for an effect to be there.
+    """One way for an effect to be there."""
 
-    Attributes:
-        effect: registered name.
-        probes: what was changed to see it; empty for one whose columns the box has.
-        shapes: values of its shapes.
-        exact: whether it is evaluated and begun just as it was probed, since it is far from linear: half a torque limit
-            may clip nothing.
-    """
-
-    effect: str
-    probes: tuple[Probe, ...] = ()
-    shapes: Theta = field(default_factory=dict)
+    effect: str  # registered name
+    probes: tuple[Probe, ...] = ()  # what was changed to see it; empty for one whose columns the box has
+    shapes: Theta = field(default_factory=dict)  # values of its shapes
+    # whether it is evaluated and begun just as it was probed, since it is far from linear: half a torque limit may clip
+    # nothing
     exact: bool = False
 
     @property
@@ -170,21 +164,13 @@ def _within(machine: Machine, key: Key, change: float | np.ndarray, like: np.nda
 
 @dataclass(frozen=True)
 class Screened:
-    """What the linear model predicts for one variant.
+    """What the linear model predicts for one variant."""
 
-    Attributes:
-        variant: which.
-        theta: where a fit would begin.
-        gain: mean fall of log chi2 over the windows.
-        relief: fall of chi2 and priors per value, if the effect may leave its tolerance.
-        signal: largest chi2 that twice its tolerance adds to one value of a window, on average over the window.
-    """
-
-    variant: Variant
-    theta: Theta
-    gain: float
-    relief: float
-    signal: float
+    variant: Variant  # which
+    theta: Theta  # where a fit would begin
+    gain: float  # mean fall of log chi2 over the windows
+    relief: float  # fall of chi2 and priors per value, if the effect may leave its tolerance
+    signal: float  # largest chi2 that twice its tolerance adds to one value of a window, on average over the window
 
 
 def screen(

@@ -244,15 +244,11 @@ def refitted(scorer: Scorer, model: Model, windows: np.ndarray, dt: float) -> Mo
 
 @dataclass(frozen=True)
 class Sought:
-    """What comes of looking for one cause by initial states of its own.
+    """What comes of looking for one cause by initial states of its own."""
 
-    Attributes:
-        best: the clearest cause, or None.
-        within: values within tolerances that do most of what the best cause does, alike at all joints but for the
-            drives of one part; empty where nothing had to be asked of them.
-    """
-
-    best: Model | None
+    best: Model | None  # the clearest cause, or None
+    # values within tolerances that do most of what the best cause does, alike at all joints but for the drives of one
+    # part; empty where nothing had to be asked of them
     within: Theta
 
 

@@ -22,33 +22,21 @@ from go1exp.sim.effects.tolerances import Tolerances, sizes
 
 @dataclass(frozen=True)
 class State:
-    """A model with terms, and its fit.
+    """A model with terms, and its fit."""
 
-    Attributes:
-        scorer: of the windows.
-        splits: which windows are for what.
-        settings: the user's.
-        dt: physics step, s.
-        theta: values of the model.
-        terms: accepted effects.
-        relaxed: effects that may move within their tolerances beside those of the tolerance box.
-        kept: effects and joints that stay within tolerance although their effect is a term.
-        nominal: the linear model of what may move about the nominal values; None before the first fit.
-        fitted: that about ``theta``; None before the first fit.
-        chi2: (V, G) per value on the windows of the fit; None before it.
-    """
-
-    scorer: Scorer
-    splits: Splits
-    settings: GapSettings
-    dt: float
-    theta: Theta = field(default_factory=dict)
-    terms: tuple[str, ...] = ()
-    relaxed: tuple[str, ...] = ()
+    scorer: Scorer  # of the windows
+    splits: Splits  # which windows are for what
+    settings: GapSettings  # the user's
+    dt: float  # physics step, s
+    theta: Theta = field(default_factory=dict)  # values of the model
+    terms: tuple[str, ...] = ()  # accepted effects
+    relaxed: tuple[str, ...] = ()  # effects that may move within their tolerances beside those of the tolerance box
+    # effects and joints that stay within tolerance although their effect is a term
     kept: frozenset[tuple[str, int]] = frozenset()
+    # the linear model of what may move about the nominal values; None before the first fit
     nominal: Table | None = None
-    fitted: Table | None = None
-    chi2: np.ndarray | None = None
+    fitted: Table | None = None  # that about ``theta``; None before the first fit
+    chi2: np.ndarray | None = None  # (V, G) per value on the windows of the fit; None before it
 
     @property
     def machine(self) -> Machine:
@@ -199,57 +187,37 @@ class State:
 
 @dataclass(frozen=True)
 class LastCheck:
-    """What terms do on windows that no decision has seen.
+    """What terms do on windows that no decision has seen."""
 
-    Attributes:
-        helps: whether most windows gain, or there is no gap; true without such windows.
-        closed: share of the excess chi-squared there that is gone; NaN without such windows, or without a gap there.
-    """
-
-    helps: bool
+    helps: bool  # whether most windows gain, or there is no gap; true without such windows
+    # share of the excess chi-squared there that is gone; NaN without such windows, or without a gap there
     closed: float
 
 
 @dataclass(frozen=True)
 class Search:
-    """What is known so far in a search. Each step of a search returns a new one.
+    """What is known so far in a search. Each step of a search returns a new one."""
 
-    Attributes:
-        state: the present model, with its windows and settings.
-        rng: of tests and bootstraps; drawn from in the order of the steps.
-        progress: called with what is being done, and which share of all is finished.
-        select_chi2: (V, G) chi2 per value of the present model on held-out windows.
-        nominal: values of the model within its tolerances, before any term.
-        first: held-out excess chi-squared with these.
-        aliases: effect -> effects that do as well.
-        shares: effect -> share of bootstraps in which it is selected.
-        candidates: the evidence.
-        signal: effect -> chi2 that it would add at twice its tolerance.
-        steps: (what, held-out excess chi-squared) after every accepted term.
-        base: which of the steps is the model within its tolerances, without a term.
-        single: the term that explains nearly everything alone, or empty (``gap/search/single_cause.py``).
-        within: values within tolerances, shared by all joints, at which a fit on the ground begins.
-        marginal: whether the first term was accepted although the tolerances explain the data nearly as well.
-        rivals: fitted models that nearly did as well as the first term, best first.
-        returned: term -> share of the excess chi-squared that came back without it, in the last test of it.
-    """
-
-    state: State
-    rng: np.random.Generator
-    progress: Callable[[str, float], None]
+    state: State  # the present model, with its windows and settings
+    rng: np.random.Generator  # of tests and bootstraps; drawn from in the order of the steps
+    progress: Callable[[str, float], None]  # called with what is being done, and which share of all is finished
+    # (V, G) chi2 per value of the present model on held-out windows
     select_chi2: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
-    nominal: Theta = field(default_factory=dict)
-    first: float = math.nan
-    aliases: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    shares: Mapping[str, float] = field(default_factory=dict)
-    candidates: tuple[Candidate, ...] = ()
-    signal: Mapping[str, float] = field(default_factory=dict)
-    steps: tuple[tuple[str, float], ...] = ()
-    base: int = 0
-    single: str = ""
+    nominal: Theta = field(default_factory=dict)  # values of the model within its tolerances, before any term
+    first: float = math.nan  # held-out excess chi-squared with these
+    aliases: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # effect -> effects that do as well
+    shares: Mapping[str, float] = field(default_factory=dict)  # effect -> share of bootstraps in which it is selected
+    candidates: tuple[Candidate, ...] = ()  # the evidence
+    signal: Mapping[str, float] = field(default_factory=dict)  # effect -> chi2 that it would add at twice its tolerance
+    steps: tuple[tuple[str, float], ...] = ()  # (what, held-out excess chi-squared) after every accepted term
+    base: int = 0  # which of the steps is the model within its tolerances, without a term
+    single: str = ""  # the term that explains nearly everything alone, or empty (``gap/search/single_cause.py``)
+    # values within tolerances, shared by all joints, at which a fit on the ground begins
     within: Theta = field(default_factory=dict)
+    # whether the first term was accepted although the tolerances explain the data nearly as well
     marginal: bool = False
-    rivals: tuple[Model, ...] = ()
+    rivals: tuple[Model, ...] = ()  # fitted models that nearly did as well as the first term, best first
+    # term -> share of the excess chi-squared that came back without it, in the last test of it
     returned: Mapping[str, float] = field(default_factory=dict)
 
     @property

@@ -97,18 +97,13 @@ class Bounds:
 
 @dataclass(frozen=True)
 class Freedom:
-    """What may leave its tolerance.
+    """What may leave its tolerance."""
 
-    Attributes:
-        tolerances: of all parameters.
-        effects: that may.
-        kept: effects and joints that may not although their effect may elsewhere.
-        rigid: whether all others stay at their nominal values, and not only within their tolerances (an ablation).
-    """
-
-    tolerances: Tolerances
-    effects: frozenset[str] = frozenset()
+    tolerances: Tolerances  # of all parameters
+    effects: frozenset[str] = frozenset()  # that may
+    # effects and joints that may not although their effect may elsewhere
     kept: frozenset[tuple[str, int]] = frozenset()
+    # whether all others stay at their nominal values, and not only within their tolerances (an ablation)
     rigid: bool = False
 
     def also(self, *effects: str) -> Freedom:

@@ -41,27 +41,16 @@ Values = Mapping[str, Mapping[str, Mapping[str, float]]]
 
 @dataclass(frozen=True)
 class Applied:
-    """What the written files do in replay at the step of training.
+    """What the written files do in replay at the step of training."""
 
-    Attributes:
-        files: that were written.
-        physics_dt: the step, s.
-        before: held-out excess of the plain model at that step.
-        after: with ``effect.yaml`` and ``calibration.yaml`` as training reads them.
-        effect_only: with ``effect.yaml`` alone.
-        reported: excess that the search had at its own step with what ``effect.yaml`` holds.
-        closed: share of the excess that the files remove.
-        holds: whether the model with the files is as good at this step as was reported, and not worse than
-            the plain one.
-    """
-
-    files: tuple[Path, ...]
-    physics_dt: float
-    before: float
-    after: float
-    effect_only: float
-    reported: float
-    closed: float
+    files: tuple[Path, ...]  # that were written
+    physics_dt: float  # the step, s
+    before: float  # held-out excess of the plain model at that step
+    after: float  # with ``effect.yaml`` and ``calibration.yaml`` as training reads them
+    effect_only: float  # with ``effect.yaml`` alone
+    reported: float  # excess that the search had at its own step with what ``effect.yaml`` holds
+    closed: float  # share of the excess that the files remove
+    # whether the model with the files is as good at this step as was reported, and not worse than the plain one
     holds: bool
 
 

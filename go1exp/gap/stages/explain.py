@@ -275,25 +275,15 @@ def _nested(
 
 @dataclass(frozen=True)
 class CheckResult:
-    """What a first look showed.
+    """What a first look showed."""
 
-    Attributes:
-        flaws: why the logs cannot be compared; empty if they can.
-        floors: what no model can get below.
-        windows: number of windows.
-        excess: of the plain model, over all windows (floor 0).
-        where: it is wrong.
-        not_excited: effect -> excitation to record next.
-        warnings: what was chosen, a sentence each.
-    """
-
-    flaws: tuple[str, ...]
-    floors: Floors | None = None
-    windows: int = 0
-    excess: float = float("nan")
-    where: Localisation | None = None
-    not_excited: dict[str, str] | None = None
-    warnings: tuple[str, ...] = ()
+    flaws: tuple[str, ...]  # why the logs cannot be compared; empty if they can
+    floors: Floors | None = None  # what no model can get below
+    windows: int = 0  # number of windows
+    excess: float = float("nan")  # of the plain model, over all windows (floor 0)
+    where: Localisation | None = None  # it is wrong
+    not_excited: dict[str, str] | None = None  # effect -> excitation to record next
+    warnings: tuple[str, ...] = ()  # what was chosen, a sentence each
 
     @property
     def exit_code(self) -> int:

@@ -19,29 +19,20 @@ from go1exp.logs.recording import Recording
 
 @dataclass(frozen=True)
 class Round:
-    """One turn of the loop.
+    """One turn of the loop."""
 
-    Attributes:
-        number: from 0, the recordings that it begins with.
-        recordings: how many there are.
-        robot_seconds: of all recordings so far.
-        verdict: of the search.
-        names: effects that are named, each with the rivals that are not yet excluded behind it; without a design, with
-            those that the search took for its equals.
-        power: least chance to tell a name from a rival, by the recordings so far; 1 if no rival is left. None if that
-            is not known: nothing is named, or no design could be made.
-        next: what was designed, in words; empty if the loop ends here.
-        ended: why it ends here; empty if it goes on.
-    """
-
-    number: int
-    recordings: int
-    robot_seconds: float
-    verdict: str
+    number: int  # from 0, the recordings that it begins with
+    recordings: int  # how many there are
+    robot_seconds: float  # of all recordings so far
+    verdict: str  # of the search
+    # effects that are named, each with the rivals that are not yet excluded behind it; without a design, with those
+    # that the search took for its equals
     names: tuple[tuple[str, ...], ...]
+    # least chance to tell a name from a rival, by the recordings so far; 1 if no rival is left. None if that is not
+    # known: nothing is named, or no design could be made
     power: float | None
-    next: str
-    ended: str
+    next: str  # what was designed, in words; empty if the loop ends here
+    ended: str  # why it ends here; empty if it goes on
 
 
 @dataclass(frozen=True)

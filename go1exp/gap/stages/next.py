@@ -32,21 +32,13 @@ WIDEST = 0.5  # largest relative standard deviation of a size that is believed; 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What becomes of a pair.
+    """What becomes of a pair."""
 
-    Attributes:
-        truth: effect of the answer, or one that the recordings did not excite.
-        rival: effect that could be there in its place; empty for none.
-        before: what the recordings at hand say.
-        after: what they say with the designed one.
-        reason: why it is not separable; empty if it is.
-    """
-
-    truth: str
-    rival: str
-    before: Worth
-    after: Worth
-    reason: str
+    truth: str  # effect of the answer, or one that the recordings did not excite
+    rival: str  # effect that could be there in its place; empty for none
+    before: Worth  # what the recordings at hand say
+    after: Worth  # what they say with the designed one
+    reason: str  # why it is not separable; empty if it is
 
     @property
     def text(self) -> str:
@@ -58,27 +50,16 @@ class Verdict:
 
 @dataclass(frozen=True)
 class NextResult:
-    """The next recording.
+    """The next recording."""
 
-    Attributes:
-        verdict: ``designed``, ``nothing left``, or ``not separable``.
-        pairs: which are distinguishable, and which are not.
-        distinguishable: pairs that the recordings at hand distinguish already, in words.
-        best: the design; None if there is none.
-        rate_hz: of its commands, Hz.
-        joints: their names.
-        tried: designs that were looked at.
-        beyond: designs that went beyond a limit.
-    """
-
-    verdict: str
-    pairs: tuple[Verdict, ...]
-    distinguishable: tuple[str, ...]
-    best: Rehearsal | None
-    rate_hz: float
-    joints: tuple[str, ...]
-    tried: int = 0
-    beyond: int = 0
+    verdict: str  # ``designed``, ``nothing left``, or ``not separable``
+    pairs: tuple[Verdict, ...]  # which are distinguishable, and which are not
+    distinguishable: tuple[str, ...]  # pairs that the recordings at hand distinguish already, in words
+    best: Rehearsal | None  # the design; None if there is none
+    rate_hz: float  # of its commands, Hz
+    joints: tuple[str, ...]  # their names
+    tried: int = 0  # designs that were looked at
+    beyond: int = 0  # designs that went beyond a limit
 
     @property
     def seconds(self) -> float:

@@ -38,27 +38,19 @@ WORST = 3  # windows that are named as the worst
 
 @dataclass(frozen=True)
 class Part:
-    """The recordings of one kind of base, held or free.
+    """The recordings of one kind of base, held or free."""
 
-    Attributes:
-        joints: their names.
-        episodes: (W,) name of each window's recording.
-        begin: (W,) when the window's scored part begins, s of the recording's clock.
-        rmse: (W, C) root mean squares of simulated minus measured of each window, by channel; SI units.
-        noise: (C,) of the sensors by channel; NaN where nothing is known of it.
-        channels: (C,) names: ``q_FR_hip`` ..., ``imu_gyro_x`` ..., ``roll``, ``pitch``, ``yaw`` (a rotation in the
-            trunk's axes), and the velocity of the trunk in its own axes.
-        times_floor: chi2 per value of angles, speeds and IMU, the rest of the initial state averaged out; 1 is right.
-        curves: what is behind it: ``t`` (W, n) s, ``valid`` (W, n), and ``measured`` and ``simulated`` (W, n, C).
-    """
-
-    joints: tuple[str, ...]
-    episodes: tuple[str, ...]
-    begin: np.ndarray
-    rmse: np.ndarray
-    noise: np.ndarray
+    joints: tuple[str, ...]  # their names
+    episodes: tuple[str, ...]  # (W,) name of each window's recording
+    begin: np.ndarray  # (W,) when the window's scored part begins, s of the recording's clock
+    rmse: np.ndarray  # (W, C) root mean squares of simulated minus measured of each window, by channel; SI units
+    noise: np.ndarray  # (C,) of the sensors by channel; NaN where nothing is known of it
+    # (C,) names: ``q_FR_hip`` ..., ``imu_gyro_x`` ..., ``roll``, ``pitch``, ``yaw`` (a rotation in the trunk's axes),
+    # and the velocity of the trunk in its own axes
     channels: tuple[str, ...]
+    # chi2 per value of angles, speeds and IMU, the rest of the initial state averaged out; 1 is right
     times_floor: float
+    # what is behind it: ``t`` (W, n) s, ``valid`` (W, n), and ``measured`` and ``simulated`` (W, n, C)
     curves: Mapping[str, np.ndarray]
 
     @property
@@ -95,19 +87,12 @@ class Part:
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """The simulator beside the recordings.
+    """The simulator beside the recordings."""
 
-    Attributes:
-        flaws: why the logs cannot be replayed; empty if they can.
-        parts: the recordings by their bases.
-        warnings: what was chosen, a sentence each.
-        physics_dt: step of the simulation, s.
-    """
-
-    flaws: tuple[str, ...] = ()
-    parts: tuple[Part, ...] = ()
-    warnings: tuple[str, ...] = ()
-    physics_dt: float = field(default=float("nan"))
+    flaws: tuple[str, ...] = ()  # why the logs cannot be replayed; empty if they can
+    parts: tuple[Part, ...] = ()  # the recordings by their bases
+    warnings: tuple[str, ...] = ()  # what was chosen, a sentence each
+    physics_dt: float = field(default=float("nan"))  # step of the simulation, s
 
     @property
     def exit_code(self) -> int:

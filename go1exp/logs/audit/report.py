@@ -20,78 +20,45 @@ def worst(verdicts: Iterable[Verdict]) -> Verdict:
 
 @dataclass(frozen=True)
 class Finding:
-    """One result of one check.
+    """One result of one check."""
 
-    Attributes:
-        check: ``rate``, ``repeats``, ``sign``, ``delay``, ...
-        channel: column, or ``t``, or ``all`` where it concerns the whole recording.
-        verdict: ``ok`` for information, else a flaw.
-        size: the number compared with the limits, or None.
-        unit: of ``size``.
-        message: a sentence.
-    """
-
-    check: str
-    channel: str
-    verdict: Verdict
-    size: float | None
-    unit: str
-    message: str
+    check: str  # ``rate``, ``repeats``, ``sign``, ``delay``, ..
+    channel: str  # column, or ``t``, or ``all`` where it concerns the whole recording
+    verdict: Verdict  # ``ok`` for information, else a flaw
+    size: float | None  # the number compared with the limits, or None
+    unit: str  # of ``size``
+    message: str  # a sentence
 
 
 @dataclass(frozen=True)
 class Channel:
-    """One column in numbers; None where a number is undefined.
+    """One column in numbers; None where a number is undefined."""
 
-    Attributes:
-        name: column.
-        verdict: worst of the findings about it.
-        unit: of ``low``, ``high``, ``step`` and ``noise``.
-        low: smallest value.
-        high: largest value.
-        step: quantisation; 0 where values are continuous.
-        noise: standard deviation between samples, an upper bound while the joint moves fast.
-        repeats: share of stale samples while the channel moves.
-        delay_ms: delay from command to response, ms, of the columns ``q_J``.
-        delay_sd_ms: its standard error, ms.
-    """
-
-    name: str
-    verdict: Verdict
-    unit: str
-    low: float
-    high: float
-    step: float | None = None
-    noise: float | None = None
-    repeats: float | None = None
-    delay_ms: float | None = None
-    delay_sd_ms: float | None = None
+    name: str  # column
+    verdict: Verdict  # worst of the findings about it
+    unit: str  # of ``low``, ``high``, ``step`` and ``noise``
+    low: float  # smallest value
+    high: float  # largest value
+    step: float | None = None  # quantisation; 0 where values are continuous
+    noise: float | None = None  # standard deviation between samples, an upper bound while the joint moves fast
+    repeats: float | None = None  # share of stale samples while the channel moves
+    delay_ms: float | None = None  # delay from command to response, ms, of the columns ``q_J``
+    delay_sd_ms: float | None = None  # its standard error, ms
 
 
 @dataclass(frozen=True)
 class AuditReport:
-    """The audit of one recording.
+    """The audit of one recording."""
 
-    Attributes:
-        episode: its name.
-        samples: number of rows.
-        duration: s.
-        rate_hz: one over the median step of ``t``.
-        channels: one line for each column, ``t`` first.
-        findings: flaws first, then facts.
-        torque_off: stretches with actuators off, (start, end) in s.
-        still: stretches in which no joint moves, (start, end) in s.
-        impossible: numbers of the few rows that their neighbours rule out; the other checks are without them.
-    """
-
-    episode: str
-    samples: int
-    duration: float
-    rate_hz: float
-    channels: tuple[Channel, ...]
-    findings: tuple[Finding, ...]
-    torque_off: tuple[tuple[float, float], ...] = ()
-    still: tuple[tuple[float, float], ...] = ()
+    episode: str  # its name
+    samples: int  # number of rows
+    duration: float  # s
+    rate_hz: float  # one over the median step of ``t``
+    channels: tuple[Channel, ...]  # one line for each column, ``t`` first
+    findings: tuple[Finding, ...]  # flaws first, then facts
+    torque_off: tuple[tuple[float, float], ...] = ()  # stretches with actuators off, (start, end) in s
+    still: tuple[tuple[float, float], ...] = ()  # stretches in which no joint moves, (start, end) in s
+    # numbers of the few rows that their neighbours rule out; the other checks are without them
     impossible: tuple[int, ...] = ()
 
     @property

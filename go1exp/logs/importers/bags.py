@@ -32,23 +32,15 @@ class Decoded(BaseModel):
 
 @dataclass(frozen=True)
 class State:
-    """What one message says of joints.
+    """What one message says of joints."""
 
-    Attributes:
-        log_ns: time of logging, ns.
-        stamp_ns: time of its header, ns; 0 if it has none.
-        source: what tells publishers of one topic apart.
-        names: joints.
-        fields: ``position``, ``velocity`` and ``effort``, one value for each joint, or none.
-        message: all of it.
-    """
-
-    log_ns: int
-    stamp_ns: int
-    source: tuple[Any, ...]
-    names: tuple[str, ...]
+    log_ns: int  # time of logging, ns
+    stamp_ns: int  # time of its header, ns; 0 if it has none
+    source: tuple[Any, ...]  # what tells publishers of one topic apart
+    names: tuple[str, ...]  # joints
+    # ``position``, ``velocity`` and ``effort``, one value for each joint, or none
     fields: Mapping[str, Sequence[float]]
-    message: Any
+    message: Any  # all of it
 
 
 @dataclass(frozen=True)

@@ -171,19 +171,12 @@ def _foot_forces(data: Arrays, rows: np.ndarray) -> tuple[dict[str, np.ndarray],
 
 @dataclass(frozen=True, eq=False)
 class Mocap:
-    """Motion capture of a run, on the robot's clock: valid samples only.
+    """Motion capture of a run, on the robot's clock: valid samples only."""
 
-    Attributes:
-        t: s (M,).
-        position: of the marker body, world, m (M, 3).
-        attitude: of the robot's body (M,).
-        shift: by which the source's clock was corrected, s; 0 if it was not.
-    """
-
-    t: np.ndarray
-    position: np.ndarray
-    attitude: Rotation
-    shift: float
+    t: np.ndarray  # s (M,)
+    position: np.ndarray  # of the marker body, world, m (M, 3)
+    attitude: Rotation  # of the robot's body (M,)
+    shift: float  # by which the source's clock was corrected, s; 0 if it was not
 
 
 def motion_capture(data: Arrays, t: np.ndarray, gyro: np.ndarray, resync: bool = True) -> Mocap:

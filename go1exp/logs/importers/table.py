@@ -40,23 +40,14 @@ _WRONG_WIDTH = re.compile(r"Row #(\d+): Expected (\d+) columns, got (\d+)")
 
 @dataclass(frozen=True)
 class Layout:
-    """How a file is written.
+    """How a file is written."""
 
-    Attributes:
-        header: whether the first line has the names of the columns.
-        skip_lines: lines before that.
-        delimiter: what stands between two columns.
-        decimal: decimal point, or comma.
-        encoding: how characters are written as bytes; a name that Python knows.
-        units: whether the line below the names has their units; found by ``read``.
-    """
-
-    header: bool = True
-    skip_lines: int = 0
-    delimiter: str = ","
-    decimal: str = "."
-    encoding: str = UTF8
-    units: bool = False
+    header: bool = True  # whether the first line has the names of the columns
+    skip_lines: int = 0  # lines before that
+    delimiter: str = ","  # what stands between two columns
+    decimal: str = "."  # decimal point, or comma
+    encoding: str = UTF8  # how characters are written as bytes; a name that Python knows
+    units: bool = False  # whether the line below the names has their units; found by ``read``
 
     @property
     def is_utf8(self) -> bool:
@@ -66,19 +57,12 @@ class Layout:
 
 @dataclass(frozen=True)
 class Table:
-    """Columns of a file.
+    """Columns of a file."""
 
-    Attributes:
-        columns: name -> (T,) numbers; a column of labels may be words.
-        unused: names of the other columns.
-        place: row from 0 -> where it stands in the file, such as ``line 12``.
-        units: name -> unit, as a line below the names gives it.
-    """
-
-    columns: dict[str, np.ndarray]
-    unused: list[str]
-    place: Callable[[int], str]
-    units: dict[str, str] = field(default_factory=dict)
+    columns: dict[str, np.ndarray]  # name -> (T,) numbers; a column of labels may be words
+    unused: list[str]  # names of the other columns
+    place: Callable[[int], str]  # row from 0 -> where it stands in the file, such as ``line 12``
+    units: dict[str, str] = field(default_factory=dict)  # name -> unit, as a line below the names gives it
 
 
 class _NoNumber(ValueError):

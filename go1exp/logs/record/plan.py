@@ -27,27 +27,16 @@ ROW_BYTES = MOTION_BYTES + (4 + 8) * (4 * robot.NUM_JOINTS + 14)
 
 @dataclass(frozen=True)
 class Episode:
-    """One recording to make.
+    """One recording to make."""
 
-    Attributes:
-        name: unique in its set.
-        excitation: name of the motion.
-        motion: what to command, at the logger's rate.
-        kp: position gain, N m/rad.
-        kd: velocity gain, N m s/rad.
-        hang: roll and pitch at which a held trunk hangs, rad; None on the ground.
-        repeat_of: name of the episode that this one repeats.
-        seed: seed of the logger's noise.
-    """
-
-    name: str
-    excitation: str
-    motion: Motion
-    kp: float
-    kd: float
-    hang: tuple[float, float] | None
-    repeat_of: str | None
-    seed: int
+    name: str  # unique in its set
+    excitation: str  # name of the motion
+    motion: Motion  # what to command, at the logger's rate
+    kp: float  # position gain, N m/rad
+    kd: float  # velocity gain, N m s/rad
+    hang: tuple[float, float] | None  # roll and pitch at which a held trunk hangs, rad; None on the ground
+    repeat_of: str | None  # name of the episode that this one repeats
+    seed: int  # seed of the logger's noise
 
 
 @dataclass(frozen=True)

@@ -274,25 +274,17 @@ def policy_task(rig: Rig, trained: TaskConfig, seconds: float) -> TaskConfig:
 
 @dataclass(frozen=True)
 class Walk:
-    """A policy to record.
+    """A policy to record."""
 
-    Attributes:
-        trained: the task that it was trained in.
-        policy: observations (N, O) -> actions (N, 12); or None, and ``drive``.
-        names: names of the episodes, one robot each.
-        seconds: length of each, s.
-        hang: roll and pitch of a held trunk, rad, if the feet are to be in the air; None on the ground.
-        drive: lets controllers move the robots of an environment, and returns what is called in place of the policy.
-        excitation: what the recordings call it.
-    """
-
-    trained: TaskConfig
-    policy: Callable[[Tensor], Tensor] | None
-    names: Sequence[str]
-    seconds: float
+    trained: TaskConfig  # the task that it was trained in
+    policy: Callable[[Tensor], Tensor] | None  # observations (N, O) -> actions (N, 12); or None, and ``drive``
+    names: Sequence[str]  # names of the episodes, one robot each
+    seconds: float  # length of each, s
+    # roll and pitch of a held trunk, rad, if the feet are to be in the air; None on the ground
     hang: tuple[float, float] | None
+    # lets controllers move the robots of an environment, and returns what is called in place of the policy
     drive: Callable[[Go1Core], Callable[[Tensor], Tensor]] | None = None
-    excitation: str = "policy"
+    excitation: str = "policy"  # what the recordings call it
 
 
 def play_policy(rig: Rig, walk: Walk, sensors: SensorConfig, seed: int, on_step: Progress) -> list[Recording]:
