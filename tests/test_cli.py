@@ -33,7 +33,7 @@ from tests.command import run as cli
 from tests.small_run import small, trained
 
 SMALL = small("ppo=paper")
-HEAVY = {"mujoco", "stable_baselines3", "gymnasium", "torch.nn", "wandb", "tensorboard", "matplotlib", "scipy"}
+HEAVY = {"mujoco", "stable_baselines3", "gymnasium", "torch.nn", "wandb", "tensorboard", "matplotlib", "scipy.stats"}
 
 
 def assert_refused(tmp_path: Path, arguments: list[str], *said: str) -> None:
@@ -367,7 +367,7 @@ def test_the_general_help_names_every_verb_and_loads_nothing(arguments: list[str
     for verb, text in VERBS.items():
         assert re.search(rf"^  {verb} +{re.escape(text)}$", done.stdout, re.MULTILINE)
     loaded = set(json.loads((tmp_path / "modules.json").read_text()))
-    assert not (HEAVY | {"hydra", "numpy", "pydantic", "torch"}) & loaded
+    assert not (HEAVY | {"hydra", "numpy", "pydantic", "scipy", "torch"}) & loaded
 
 
 EVERY = [*VERBS, *(f"{verb} {word}" for verb, words in SUBVERBS.items() for word in words)]

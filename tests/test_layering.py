@@ -47,7 +47,7 @@ ORDER = {
     "deploy": ("estimation", "runtime", "__main__.py", "export", "sim_robot"),
     "evaluate": (
         *("statistics", "quantities.py", "controller", "recorder.py", "agents.py"),
-        *("rollout.py", "footfalls.py", "video.py", "stick.py", "criteria.py", "table.py", "asynchronous.py"),
+        *("rollout.py", "footfalls.py", "video.py", "criteria.py", "table.py", "asynchronous.py"),
         *("protocol", "report", "bench", "viewer"),
     ),
 }
@@ -207,7 +207,7 @@ BROWSER = {f"evaluate/viewer/{name}.py" for name in STUDIO}
 
 def test_mujoco_stays_in_the_physics_and_where_pictures_are_made() -> None:
     outside = {name for name in importers("mujoco") if not name.startswith("sim/physics/")}
-    assert outside <= {"sim/env/camera.py", "evaluate/video.py", "evaluate/stick.py", "evaluate/bench/env.py", *BROWSER}
+    assert outside <= {"sim/env/camera.py", "evaluate/video.py", "evaluate/bench/env.py", *BROWSER}
 
 
 def test_wandb_and_tensorboard_stay_in_the_metrics() -> None:

@@ -13,10 +13,8 @@ from go1exp import robot
 from go1exp.config.compose import compose
 from go1exp.evaluate.protocol.base import chosen
 from go1exp.evaluate.protocol.ground import COURSE, RESOLUTION, RUN_UP, SHAPES, TREAD, UNITS, Lanes, goal
-from go1exp.evaluate.protocol.kinds import gait, hardware, push_map, rate, terrain
-from go1exp.evaluate.protocol.kinds.energy import effort
-from go1exp.evaluate.protocol.plan import Impulses, Kicker, Motion, heading
-from go1exp.evaluate.protocol.signals import Constant, Sine, Steps, phasors, response
+from go1exp.evaluate.protocol.kinds import energy, gait, push_map, rate, terrain
+from go1exp.evaluate.protocol.plan import Constant, Impulses, Kicker, Motion, Sine, Steps, heading, phasors, response
 from go1exp.evaluate.protocol.stage import delay_of_effects
 from go1exp.mdp.measures.trace import Trace
 from go1exp.sim.task import parse_train
@@ -57,7 +55,7 @@ def motion(**changes: Any) -> Motion:
 
 def test_effort_is_what_the_formulas_say() -> None:
     """12 joints of 5 N m at -2 rad/s brake 120 W; 10 kg at 0.5 m/s."""
-    braking = {k: float(v[0]) for k, v in effort(trace(5.0, -2.0, 0.5)).items()}
+    braking = {k: float(v[0]) for k, v in energy.effort(trace(5.0, -2.0, 0.5)).items()}
     weight = 10.0 * 9.81 * 0.5
     assert braking["power_p99"] == pytest.approx(120.0)
     assert braking["power_max"] == pytest.approx(120.0)
@@ -65,10 +63,10 @@ def test_effort_is_what_the_formulas_say() -> None:
     assert braking["heat_per_way"] == pytest.approx(12 * 25.0 / weight)
     assert braking["protect_level"] == 2.0
     assert braking["saturated"] == 0.0
-    full = effort(trace(23.7, 0.0, 0.5))
+    full = energy.effort(trace(23.7, 0.0, 0.5))
     assert full["saturated"][0] == pytest.approx(2 / 3)  # calves have more
-    assert np.isnan(effort(trace(5.0, 1.0, 0.05))["cost_of_transport_abs"][0])
-    assert np.isnan(effort(trace(5.0, 1.0, 0.5, until=0))["power_max"][0])
+    assert np.isnan(energy.effort(trace(5.0, 1.0, 0.05))["cost_of_transport_abs"][0])
+    assert np.isnan(energy.effort(trace(5.0, 1.0, 0.5, until=0))["power_max"][0])
 
 
 def test_symmetry_is_the_worst_pairs() -> None:
@@ -130,9 +128,9 @@ def test_a_delay_of_the_robots_own_stays() -> None:
 
 def test_the_delay_margin_ends_where_the_first_robot_falls() -> None:
     rows = [{"delay_ms": d, "fell": d >= 30.0 and n == 1, "robot": n} for d in (0.0, 10.0, 20.0, 30.0) for n in (0, 1)]
-    assert hardware._margin(rows) == 20.0
-    assert hardware._margin([r for r in rows if r["delay_ms"] < 30.0]) == 20.0
-    assert hardware._margin([{**r, "fell": True} for r in rows]) == 0.0  # beyond the limit, and not unknown
+    assert energy._margin(rows) == 20.0
+    assert energy._margin([r for r in rows if r["delay_ms"] < 30.0]) == 20.0
+    assert energy._margin([{**r, "fell": True} for r in rows]) == 0.0  # beyond the limit, and not unknown
 
 
 def test_the_gain_of_a_faster_rate_is_paired() -> None:

@@ -84,11 +84,7 @@ def _verb(arguments: list[str]) -> tuple[str, list[str]]:
 
 
 def _need_streams() -> None:
-    """Replace standard streams that are closed, whose numbers the next files would get, by ones to nowhere.
-
-    Raises:
-        Expected: if that of the output is closed.
-    """
+    """Point closed standard streams, whose numbers files would get, to nowhere; raise Expected if that of output is."""
     closed = [number for number, stream in enumerate((sys.stdin, sys.stdout, sys.stderr)) if stream is None]
     for number in closed:
         nowhere = os.open(os.devnull, os.O_RDWR)

@@ -169,11 +169,7 @@ def _refuse_unknown_schedule(overrides: Sequence[str], folders: Sequence[Path]) 
 
 
 def _without_config_dir(arguments: Sequence[str]) -> tuple[list[str], list[Path]]:
-    """Return the arguments without ``--config-dir DIR``, and that folder: we show it to Hydra ourselves, filtered.
-
-    Raises:
-        ConfigError: if it is no folder.
-    """
+    """Return arguments without ``--config-dir DIR``, and DIR, which Hydra gets filtered; raise ConfigError if none."""
     folders = given_folders(arguments)[1:]
     if missing := [str(folder) for folder in folders if not folder.is_dir()]:
         raise ConfigError([f"--config-dir {folder}: no such folder" for folder in missing])
@@ -257,11 +253,7 @@ MEANING = "files and packages with terms of your own, such as [my_terms.py] (doc
 
 
 def begin(verb: str, container: dict[str, Any]) -> dict[str, Any]:
-    """Load the plugins of a command line, and those of the run that it names; return the rest of the configuration.
-
-    Raises:
-        ConfigError: if a plugin is missing, fails, or registers nothing.
-    """
+    """Load the plugins of a command line and its run; return the other settings; raise ConfigError if one fails."""
     if verb == "train":  # whose configuration is parsed with its plugins
         plugins.begin()
         return container

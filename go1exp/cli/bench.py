@@ -119,7 +119,6 @@ def _task(container: dict[str, Any]) -> None:
 
 
 def _actuator(task: TaskConfig, timing: tuple[Any, ...]) -> dict[str, float]:
-    """Run the suite that also records and fits."""
     import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
     from go1exp.evaluate.bench import actuator
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field
 
 from go1exp.base.files import write_json, write_text
 from go1exp.cli import subjects
@@ -12,12 +14,37 @@ from go1exp.cli.app import App, announce, parse, spinner
 from go1exp.cli.evaluate import RATES, note_replaced, refuse
 from go1exp.cli.places import writable
 from go1exp.cli.subjects import Named, Variation, agent, varied
+from go1exp.config.schema import settings as schema
 from go1exp.config.schema.registry import ConfigError
-from go1exp.evaluate.protocol.base import CompareSettings
 
 if TYPE_CHECKING:
     from go1exp.evaluate.protocol.base import Chosen
     from go1exp.evaluate.protocol.playing import Result
+
+
+@schema.settings
+class CompareSettings:
+    """``conf/compare.yaml`` without the groups.
+
+    Attributes:
+        subjects: two or more, each a shipped policy, a run folder or a bundle (.zip); with @100hz at that rate, with
+            @estimated or @exact velocity. All others are compared with the first.
+        same_robot: all on the robot of the first: its actuators, effects, contact, randomisation and falls; false takes
+            each one's own.
+        seed: seed of everything random, the same for all.
+        physics_dt: another physics step, s; null keeps that of training.
+        folder: for compare.html, compare.json and the rows.
+    """
+
+    subjects: Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=2)]
+    same_robot: bool
+    seed: Annotated[int, Field(ge=0)]
+    physics_dt: Annotated[float, Field(gt=0, le=0.02)] | None
+    folder: Annotated[str, Field(min_length=1)]
+
+    def __post_init__(self) -> None:
+        if len(set(self.subjects)) < len(self.subjects):
+            raise ValueError(f"subjects = {list(self.subjects)}: each only once")
 
 
 def _task(container: dict[str, Any]) -> None:
@@ -81,7 +108,6 @@ def _with(protocols: list[Chosen], trunk_velocity: Any) -> list[Chosen]:
 
 
 def _report(plays: dict[str, list[Result]], folder: Path, about: dict[str, Any]) -> None:
-    """Write page, JSON and rows, and print the verdicts."""
     from go1exp.evaluate.protocol import comparing
     from go1exp.evaluate.protocol.pages import comparison
     from go1exp.evaluate.protocol.playing import as_json

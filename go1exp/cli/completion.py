@@ -191,12 +191,10 @@ def _by_position(verb: str, word: str, before: Sequence[str], folders: Sequence[
 
 
 def _shipped() -> list[str]:
-    """Return the names of the shipped policies."""
     return sorted(file.parent.name for file in (data_root() / "assets/policies").glob("*/config.yaml"))
 
 
 def _listed(folders: Sequence[Path]) -> list[str]:
-    """Return the groups that ``go1exp list`` knows."""
     return sorted({*(group for folder in folders for group in groups_in(folder)), "importer", "excitation", "measure"})
 
 
@@ -271,7 +269,6 @@ def _paths(value: str, suffixes: Sequence[str], runs: bool = False) -> Iterator[
 
 
 def _checkpoints(before: Sequence[str]) -> list[str]:
-    """Return the checkpoints of the run that the line names."""
     run = next((Path(word[len("run=") :]) for word in before if word.startswith("run=")), None)
     return sorted(file.name for file in (run / "checkpoints").glob("*.pt")) if run else []
 

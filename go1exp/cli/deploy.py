@@ -146,7 +146,6 @@ def _refuse_misfits(settings: DeploySettings, other: dict[str, Any], controlled:
 
 
 def _check(settings: DeploySettings) -> int:
-    """Check the robot."""
     from go1exp import robot
     from go1exp.deploy.runtime.job import run_check
 

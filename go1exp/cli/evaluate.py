@@ -176,11 +176,7 @@ def playable(protocols: Sequence[Chosen], agent: Agent) -> list[Chosen]:
 
 
 def writable_file(out: Path) -> None:
-    """Make the folder of a file for results, before the work begins; ``/dev/stdout`` and pipes are taken as they are.
-
-    Raises:
-        ConfigError: if nothing can be written there.
-    """
+    """Make the folder of a file for results, but of no device or pipe; raise ConfigError if it cannot be written."""
     if out.exists() and not out.is_file():
         return
     try:
@@ -254,7 +250,6 @@ class _Conditions:
 
 
 def _protocols(settings: Any, protocols: list[Any], conditions: _Conditions) -> None:
-    """Play what is not the grid."""
     refuse_rates(protocols, conditions.controller.name if conditions.controller else None, settings.policy_dt)
     subject = subjects.subject_of(settings, conditions.controller, "protocols")
     announce(f"evaluating {subject.label}")
@@ -293,7 +288,6 @@ def _task(container: dict[str, Any]) -> None:
 
 
 def _check_grid(settings: Any) -> None:
-    """Refuse what the grid cannot play."""
     if settings.bundle is not None:
         raise ConfigError([f"bundle = {settings.bundle!r}: protocol=grid takes run or policy; choose another protocol"])
     grid_is_empty = not all((settings.grid.x, settings.grid.y, settings.grid.yaw))
@@ -313,7 +307,6 @@ def _of_grid(settings: Any, controller: MpcSettings | None) -> tuple[Path, Path 
 def _grid(
     settings: Any, measures: list[Term], conditions: _Conditions, run: Path, checkpoint: Path | None, out: Path
 ) -> None:
-    """Play the grid of constant commands."""
     show = spinner(1, "evaluating", at_once=True)
     from go1exp.config.schema.settings import subset
     from go1exp.evaluate import criteria, table

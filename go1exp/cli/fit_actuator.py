@@ -57,11 +57,7 @@ def _inverse_dynamics(config: RobotConfig, smoothing: float | None) -> Callable[
 
 
 def _with_gains(recordings: list[Recording], gains: tuple[float, float] | None) -> list[Recording]:
-    """Return the recordings made with these gains, kp N m/rad and kd N m s/rad; all of them for None.
-
-    Raises:
-        ConfigError: if there is none.
-    """
+    """Return recordings of these gains, N m/rad and N m s/rad, or all for None; raise ConfigError if there is none."""
     if gains is None:
         return recordings
     kp, kd = gains

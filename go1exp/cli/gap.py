@@ -73,11 +73,7 @@ class GapVerb:
 
 
 def with_logs(container: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings with no logs where none are needed: ``report`` and ``view`` read the answer alone.
-
-    Raises:
-        ConfigError: if a stage was meant to be another verb.
-    """
+    """Return the settings, without logs for ``report`` and ``view``; raise ConfigError if a stage was to be a verb."""
     from go1exp.cli.completion import STAGES
 
     words, stage = ("all", *STAGES, *SUBVERBS["gap"]), str(container.get("stage", "all"))
@@ -159,7 +155,6 @@ def refuse_unknown(effects: Sequence[str]) -> None:
 
 
 def _view(settings: GapVerb, parts: dict[str, Any], where: tuple[str, int]) -> int:
-    """Show the answer in the browser."""
     from go1exp.gap.robots.fixed_base import robot_of
 
     gap(Path(settings.out), robot_of(parts["model"], parts["robot"]), parts["robot"], where)
@@ -195,7 +190,6 @@ def _check(recordings: list[Recording], robot: Robot, settings: GapVerb) -> int:
 
 
 def _localise(recordings: list[Recording], robot: Robot, settings: GapVerb) -> int:
-    """Print where the nominal model is wrong."""
     from go1exp.gap.report import localisation_text
     from go1exp.gap.stages.explain import check
 
@@ -288,7 +282,6 @@ def _contact_choice(contact: ContactConfig | None) -> dict[str, str]:
 
 
 def _report(result: GapResult, out: Path) -> int:
-    """Write the report."""
     from go1exp.gap.report import text, write_report
 
     status = _status(result, out)

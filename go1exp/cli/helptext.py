@@ -40,11 +40,7 @@ WITHOUT_IN = {
 
 
 def show(verb: str, arguments: Sequence[str]) -> None:
-    """Print the help of a verb, or of the group that is named among the arguments.
-
-    Raises:
-        ConfigError: if a word among them names nothing that there is help for.
-    """
+    """Print the help of a verb, or of a group named among the arguments; raise ConfigError for a word without help."""
     words, title = parted(arguments)[2], f"go1exp {verb.replace('_', ' ')}"
     if subverb := next((word for word in words if word in SUBVERBS.get(verb, ())), None):
         show(f"{verb}_{subverb}", [word for word in arguments if word != subverb])

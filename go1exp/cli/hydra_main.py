@@ -175,11 +175,7 @@ def run(
 
 
 def sweep_range(text: str) -> tuple[str, dict[str, Any]]:
-    """Return key and range of an override in Hydra's grammar for sweeps: low, high, step, log; or choices.
-
-    Raises:
-        ValueError: if the text is no range of a key.
-    """
+    """Return key and range (low, high, step, log) or choices of a sweep's override; raise ValueError if it is none."""
     try:
         (override,) = OverridesParser.create().parse_overrides([text])
     except HydraException as error:
@@ -264,11 +260,7 @@ def _choice(group: str, file: str, verb: str) -> str:
 
 
 def mapping_of(given: Mapping[str, Any] | str | None, key: str) -> dict[str, Any]:
-    """Return a setting that is a mapping or the ``FILE.yaml`` of one; an empty one for None.
-
-    Raises:
-        ConfigError: if the file is missing, empty, no YAML or no mapping, naming ``key``.
-    """
+    """Return a setting that is a mapping or its ``FILE.yaml``, {} for None; raise ConfigError of a bad file."""
     if given is None:
         return {}
     if not isinstance(given, str):

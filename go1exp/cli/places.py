@@ -94,11 +94,7 @@ def files_of(places: str | Sequence[str]) -> list[Path]:
 
 
 def writable(folder: str, key: str = "out") -> Path:
-    """Make a folder for results and return it, before the work begins.
-
-    Raises:
-        ConfigError: if nothing can be written there.
-    """
+    """Make a folder for results before the work begins, and return it; raise ConfigError if it cannot be written to."""
     path = Path(folder)
     try:
         path.mkdir(parents=True, exist_ok=True)

@@ -83,7 +83,6 @@ def _ground(given: Any) -> TerrainConfig | None:
 
 
 def _log(settings: PlaySettings, where: tuple[str, int]) -> None:
-    """Show a recording in the browser."""
     given = {name: getattr(settings, name) for name in ("run", "policy", "bundle", "checkpoint", "out")}
     wrong = [
         f"log = {settings.log!r} and {name} = {value!r}: only one of them" for name, value in given.items() if value
@@ -101,7 +100,6 @@ def _show(
 ) -> None:
     """Write clip and picture, with their ``progress``, or open the live viewer without one."""
     from go1exp.evaluate import video
-    from go1exp.evaluate.stick import picture
     from go1exp.sim.env.camera import RenderingUnavailable
 
     if progress is None:
@@ -113,7 +111,7 @@ def _show(
     try:
         frames = video.record(core, policy, settings.seconds, fps=settings.fps, on_frame=progress, footfalls=True)
     except RenderingUnavailable as error:
-        picture(core, policy, settings.seconds, out.with_suffix(".png"))
+        video.picture(core, policy, settings.seconds, out.with_suffix(".png"))
         print(f"{error}\nA stick figure instead: {out.with_suffix('.png')}")
         return
     gif = out.suffix.lower() == ".gif"

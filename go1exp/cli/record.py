@@ -125,7 +125,6 @@ def _motions(given: Any) -> list[Term]:
 
 
 def _unused(settings: RecordSettings) -> list[str]:
-    """Return problems of settings of motions that a policy ignores."""
     wrong = []
     if len(settings.gains) > 1 or settings.repeats or len(settings.seeds) > 1:
         wrong.append("gains, seeds, repeats: are for motions; a policy's gains are actuator.kp and actuator.kd")
@@ -230,7 +229,6 @@ def _record_mpc(rig: Rig, controller: MpcSettings, settings: RecordSettings) -> 
 
 
 def _write(out: Path, recordings: list[Recording]) -> None:
-    """Write the recordings and print their number and length."""
     from go1exp.logs import recording
 
     for r in recordings:

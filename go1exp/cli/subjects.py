@@ -26,11 +26,7 @@ ENGINE = "engine"
 
 
 def split_engine(container: dict[str, Any]) -> tuple[BackendConfig, dict[str, Any]]:
-    """Return the checked engine, and what is left of the configuration.
-
-    Raises:
-        ConfigError: with every problem of its settings, or if it is not installed.
-    """
+    """Return the checked engine, and other settings; raise ConfigError of all problems, or if not installed."""
     from go1exp.config.schema.physics import PhysxBackend
     from go1exp.sim.task import parse_parts
 
@@ -47,11 +43,7 @@ ROBOT_GROUPS = ("actuator", "effect", "contact")
 
 
 def split_robot(container: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the checked choices of another robot, by group, and what is left of the configuration.
-
-    Raises:
-        ConfigError: with every problem of the choices.
-    """
+    """Return the checked choices of another robot, by group, and other settings; raise ConfigError of problems."""
     from go1exp.sim.task import parse_parts
 
     chosen = {name: container[name] for name in ROBOT_GROUPS if container.get(name) is not None}

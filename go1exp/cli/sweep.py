@@ -166,7 +166,6 @@ def _checked(
 
 @contextmanager
 def _noting(app: App, problems: dict[str, list[int]], number: int, overrides: Sequence[str] = ()) -> Iterator[None]:
-    """Collect what is wrong with a job."""
     try:
         yield
     except Exception as error:

@@ -164,11 +164,7 @@ def _go_on(run: Path, overrides: list[str]) -> int | None:
 
 
 def _planned(run: Path, overrides: list[str]) -> TrainJob:
-    """Return the training of which ``run`` holds the configuration, with what ``overrides`` may change.
-
-    Raises:
-        ConfigError: if they change what they may not.
-    """
+    """Return the training of the folder ``run``, with what ``overrides`` may change; raise ConfigError otherwise."""
     from go1exp.sim.task import parse_train
     from go1exp.train import run_folder
 

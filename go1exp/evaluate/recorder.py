@@ -44,11 +44,7 @@ class Recorder:
     """
 
     def __init__(self, core: Go1Core, steps: int) -> None:
-        """Make room for ``steps`` policy steps; whoever observed the plant before goes on to do so.
-
-        Raises:
-            Expected: if so many do not fit into memory.
-        """
+        """Make room for ``steps`` policy steps; earlier observers stay; raise Expected if memory is too small."""
         seconds = steps * core.task.sim.policy_dt
         if wrong := memory.too_long(seconds, bytes_per_second(core.task, core.num_envs)):
             raise Expected(f"{seconds:g} s of {counted(core.num_envs, 'robot')}: what measures need of them {wrong}")

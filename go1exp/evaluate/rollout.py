@@ -75,11 +75,7 @@ class EvalConfig:
 
 
 def evaluation_task(task: TaskConfig, config: EvalConfig) -> TaskConfig:
-    """Return the task in which a policy trained on ``task`` is evaluated; always on the CPU.
-
-    Raises:
-        ConfigError: if physics step and policy period do not fit each other.
-    """
+    """Return the task that evaluates a policy of ``task``, on the CPU; raise ConfigError if its two steps misfit."""
     period = config.policy_dt or task.sim.policy_dt
     beyond = (math.ceil(config.duration_s / period) + 1) * period  # no time limit within the evaluation
     step = config.physics_dt or task.sim.physics_dt

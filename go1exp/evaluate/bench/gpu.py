@@ -136,11 +136,7 @@ def run(
     on_round: Callable[[int, int], None],
     net: Path | None = None,
 ) -> dict[str, float]:
-    """Measure; return the figures by name. ``net`` is an actuator net to step as well.
-
-    Raises:
-        ConfigError: if the configuration's backend is not a GPU's.
-    """
+    """Measure; return the figures by name, also of an actuator ``net``; raise ConfigError of another backend."""
     if not config.task.backend.on_gpu:
         raise ConfigError(["suite=gpu needs backend=warp on a CUDA device"])
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, num_envs=num_envs))

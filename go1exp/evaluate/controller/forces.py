@@ -29,11 +29,7 @@ class SolverError(Expected):
 
 
 def solver() -> Any:
-    """Return the module of the solver.
-
-    Raises:
-        SolverError: if it is not installed.
-    """
+    """Return the module of the solver; raise SolverError if it is not installed."""
     try:
         import daqp
     except ImportError as error:
@@ -110,11 +106,7 @@ class ForcePlan:
     """Builds and solves the quadratic programme."""
 
     def __init__(self, settings: ForceSettings, body: Body) -> None:
-        """Compute what does not depend on the state.
-
-        Raises:
-            SolverError: if the solver is not installed.
-        """
+        """Compute what does not depend on the state; raise SolverError if the solver is not installed."""
         self._solve = solver().solve
         self.settings, self._body = settings, body
         steps, dt = settings.steps, settings.dt

@@ -52,11 +52,7 @@ class Mpc:
     """
 
     def __init__(self, settings: MpcSettings, inertia: str = "merged") -> None:
-        """Build the model of the robot (``RobotConfig.inertia``) and the programme.
-
-        Raises:
-            go1exp.evaluate.controller.forces.SolverError: if the solver is not installed.
-        """
+        """Build the robot's model (``RobotConfig.inertia``) and the programme; raise SolverError without a solver."""
         self.settings, self.period = settings, settings.period
         self._kin = Kinematics(inertia)
         self._plan = ForcePlan(settings.force, Body(self._kin.mass, self._kin.composite_inertia()))

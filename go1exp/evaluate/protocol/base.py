@@ -12,15 +12,7 @@ from pydantic import Field
 
 from go1exp import robot
 from go1exp.base.report.plots import Drawing
-from go1exp.config.schema.registry import (
-    ConfigError,
-    Term,
-    bind_list,
-    find,
-    members,
-    unknown_name,
-    within,
-)
+from go1exp.config.schema.registry import ConfigError, Term, bind_list, find, members, unknown_name, within
 from go1exp.config.schema.settings import parse, settings
 from go1exp.evaluate.controller.types import TrunkVelocity
 from go1exp.evaluate.protocol.claims import Claim
@@ -183,31 +175,6 @@ class Protocol:
         """Write the measures of a recorded motion into the rows of its robots."""
         if motion.trace is not None and self.terms():
             add_measures(rows, measured(motion.trace, self.terms()), robot.LEGS)
-
-
-@settings
-class CompareSettings:
-    """``conf/compare.yaml`` without the groups.
-
-    Attributes:
-        subjects: two or more, each a shipped policy, a run folder or a bundle (.zip); with @100hz at that rate, with
-            @estimated or @exact velocity. All others are compared with the first.
-        same_robot: all on the robot of the first: its actuators, effects, contact, randomisation and falls; false takes
-            each one's own.
-        seed: seed of everything random, the same for all.
-        physics_dt: another physics step, s; null keeps that of training.
-        folder: for compare.html, compare.json and the rows.
-    """
-
-    subjects: Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=2)]
-    same_robot: bool
-    seed: Annotated[int, Field(ge=0)]
-    physics_dt: Annotated[float, Field(gt=0, le=0.02)] | None
-    folder: Annotated[str, Field(min_length=1)]
-
-    def __post_init__(self) -> None:
-        if len(set(self.subjects)) < len(self.subjects):
-            raise ValueError(f"subjects = {list(self.subjects)}: each only once")
 
 
 def repeated(name: str, values: Sequence[Any]) -> list[str]:

@@ -169,7 +169,6 @@ def _refuse_too_long(chosen: Chosen, stage: Stage) -> None:
 
 
 def _needed(length: Length, stage: Stage) -> float:
-    """Return what a batch takes at least, B."""
     plain, recorded = stage.bytes_per_second(length.robots, length.policy_dt)
     listening = max(length.seconds - length.settle_s, 0.0) if length.recorded else 0.0
     return length.seconds * plain + listening * recorded

@@ -51,17 +51,12 @@ def missing(runs: Sequence[Run], protocols: Sequence[Chosen | None] = (None,)) -
 
 
 def _checkpoint(run: Path, settings: EvaluationSettings) -> Path | None:
-    """Return the checkpoint to evaluate; None for the newest."""
     best = run / BEST
     return best if settings.checkpoint == "best" and best.is_file() else None
 
 
 def play_protocol(run: Run, protocol: Chosen, settings: EvaluationSettings, on_step: Progress) -> None:
-    """Play a protocol with the policy of a run and write its files into the run's folder.
-
-    Raises:
-        ValueError: if the policy cannot play the protocol.
-    """
+    """Play a protocol with a run's policy, its files into the run's folder; raise ValueError if the policy cannot."""
     config, policy, about = load_run(run.folder, _checkpoint(run.folder, settings))
     agent = PolicyAgent(run.label, config.task, policy, about=about)
     velocities = protocol.protocol.policy_velocities().items()

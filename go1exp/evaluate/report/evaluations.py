@@ -92,11 +92,7 @@ def evaluations(study: Study) -> list[Evaluation]:
 
 
 def check_figures(wanted: Sequence[str], known: Sequence[Evaluation], to_come: Sequence[Chosen | None] = ()) -> None:
-    """Refuse quantities that no evaluation has, and those without a better direction.
-
-    Raises:
-        ConfigError: naming each, with the nearest known names.
-    """
+    """Refuse quantities that no evaluation has, or of no better direction; raise ConfigError with nearest names."""
     columns = [c for each in known for c in each.columns]
     columns += [c for each in to_come for c in (each.protocol.columns() if each else _grid_columns())]
     better = {c.name for c in columns if c.better}

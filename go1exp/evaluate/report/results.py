@@ -336,11 +336,7 @@ class Report:
 
 
 def report(study: Study, settings: ReportSettings, plain: dict[str, Any]) -> Report:
-    """Make the report of a study.
-
-    Raises:
-        ConfigError: if the requested baseline or quantity does not exist.
-    """
+    """Make the report of a study; raise ConfigError if the requested baseline or quantity does not exist."""
     made = groups(study)
     first = baseline(made, settings.baseline)
     metrics = {}

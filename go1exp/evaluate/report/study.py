@@ -155,7 +155,6 @@ def _jobs(sweep: Path, notes: list[str]) -> Iterator[_Job]:
 
 
 def _read(places: dict[Path, Path], jobs: dict[Path, _Job]) -> tuple[list[Run], list[Absent]]:
-    """Return the runs in these folders, and those whose configuration is damaged."""
     labels = _labels(list(places))
     damaged, runs = [], []
     for place, shown in places.items():
@@ -187,7 +186,6 @@ def _labels(places: Sequence[Path]) -> dict[Path, str]:
 
 
 def _included(runs: Sequence[Run], absent: list[Absent], notes: list[str], unfinished: bool) -> Study:
-    """Return the runs that are included, and the others with their reasons."""
     kept: list[Run] = []
     for run in runs:
         begun = (run.folder / "metrics.csv").is_file() or any((run.folder / "checkpoints").glob("*.pt"))
@@ -234,11 +232,7 @@ def groups(study: Study) -> list[Group]:
 
 
 def baseline(made: Sequence[Group], wanted: str | None) -> Group:
-    """Return the group that others are compared with: that with most runs, or the one named.
-
-    Raises:
-        ConfigError: if no group, or more than one, matches.
-    """
+    """Return the group named, or that with most runs, to compare others with; raise ConfigError unless one matches."""
     if wanted is None:
         return max(made, key=lambda g: len(g.runs))
     exact = [g for g in made if g.name == wanted]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
 
 RESAMPLES = 9_999
@@ -42,13 +43,11 @@ class Association:
 
 def spearman(x: ArrayLike, y: ArrayLike) -> tuple[float, float]:
     """Return the rank correlation of x (n,) with y (n,), and its two-sided p by permutation; NaN where undefined."""
-    from scipy import stats
-
-    a, b = stats.rankdata(x), stats.rankdata(y)
+    a, b = scipy.stats.rankdata(x), scipy.stats.rankdata(y)
     if len(a) < 3 or np.ptp(a) == 0.0 or np.ptp(b) == 0.0:
         return math.nan, math.nan
     if len(a) > LARGE:
-        done = stats.spearmanr(a, b)
+        done = scipy.stats.spearmanr(a, b)
         return float(done.statistic), float(done.pvalue)
     centred = (b - b.mean()) / (len(b) * b.std())
 
@@ -56,7 +55,7 @@ def spearman(x: ArrayLike, y: ArrayLike) -> tuple[float, float]:
         scaled = (drawn - drawn.mean(axis=axis, keepdims=True)) / a.std()
         return np.asarray((scaled * centred).sum(axis=axis))
 
-    test = stats.permutation_test(
+    test = scipy.stats.permutation_test(
         (a,), statistic, permutation_type="pairings", vectorized=True, n_resamples=RESAMPLES, rng=0
     )
     return float(test.statistic), float(test.pvalue)
@@ -64,9 +63,7 @@ def spearman(x: ArrayLike, y: ArrayLike) -> tuple[float, float]:
 
 def explained_by_names(names: ArrayLike, y: ArrayLike) -> float:
     """Return the p of the variance of y (n,) between categories ``names`` (n,), by permutation."""
-    from scipy import stats
-
-    values = stats.rankdata(y)
+    values = scipy.stats.rankdata(y)
     labels, which = np.unique(np.asarray(names, dtype=str), return_inverse=True)
     if len(labels) < 2 or len(labels) == len(values) or np.ptp(values) == 0.0:
         return math.nan
@@ -77,7 +74,7 @@ def explained_by_names(names: ArrayLike, y: ArrayLike) -> float:
         means = np.moveaxis(drawn, axis, -1) @ member / counts
         return np.asarray((counts * means**2).sum(-1))
 
-    test = stats.permutation_test(
+    test = scipy.stats.permutation_test(
         (values,),
         between,
         permutation_type="pairings",
@@ -120,14 +117,12 @@ def permutation_importance(columns: Mapping[str, NDArray[Any]], y: NDArray[np.fl
     Each row is predicted from the other folds; shuffling a quantity raises the mean square error by twice its
     share (Breiman 2001, with a linear model in place of a forest).
     """
-    from scipy import stats
-
     n = len(y)
     blocks = {name: _features(values) for name, values in columns.items()}
     width = sum(block.shape[1] for block in blocks.values())
     if n < max(2 * FOLDS, 2 * (width + 1)) or np.ptp(y) == 0.0:
         return dict.fromkeys(columns, math.nan)
-    ranks = stats.rankdata(y)
+    ranks = scipy.stats.rankdata(y)
     target = (ranks - ranks.mean()) / ranks.std()
     rng = np.random.default_rng(0)
     fold = rng.permutation(np.arange(n) % FOLDS)
@@ -155,10 +150,8 @@ def permutation_importance(columns: Mapping[str, NDArray[Any]], y: NDArray[np.fl
 
 def _features(values: NDArray[Any]) -> NDArray[np.float64]:
     """Return the columns of a quantity: its ranks, or one for each category but the first."""
-    from scipy import stats
-
     if values.dtype.kind in "fiub":
-        ranks = stats.rankdata(values)
+        ranks = scipy.stats.rankdata(values)
         return np.asarray((ranks - ranks.mean()) / ranks.std())[:, None]
     labels, which = np.unique(values.astype(str), return_inverse=True)
     return np.asarray(np.eye(len(labels))[which][:, 1:])

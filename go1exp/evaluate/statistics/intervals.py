@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
 
 LEVEL = 0.95
@@ -41,8 +42,6 @@ def constant(values: ArrayLike, trim: float = 0.0) -> bool:
 
 def mean_interval(values: ArrayLike) -> Interval:
     """Return the mean of one value per robot with Student's t interval, NaN with fewer than two; NaNs are ignored."""
-    from scipy import stats  # takes a moment to load
-
     each = np.asarray(values, dtype=np.float64).ravel()
     each = each[np.isfinite(each)]
     if not len(each):
@@ -50,7 +49,7 @@ def mean_interval(values: ArrayLike) -> Interval:
     mean = float(each.mean())
     if len(each) < 2:
         return Interval(mean, np.nan, np.nan, 1)
-    half = float(stats.t.ppf(0.5 + 0.5 * LEVEL, len(each) - 1) * each.std(ddof=1) / np.sqrt(len(each)))
+    half = float(scipy.stats.t.ppf(0.5 + 0.5 * LEVEL, len(each) - 1) * each.std(ddof=1) / np.sqrt(len(each)))
     return Interval(mean, mean - half, mean + half, len(each))
 
 
@@ -68,11 +67,9 @@ def phase_interval(phases: ArrayLike) -> Interval:
 
 def share_interval(count: int, n: int) -> Interval:
     """Return the share ``count`` / ``n`` with Wilson's interval."""
-    from scipy import stats
-
     if n < 1:
         return Interval(np.nan, np.nan, np.nan, 0)
-    bounds = stats.binomtest(count, n).proportion_ci(LEVEL, method="wilson")
+    bounds = scipy.stats.binomtest(count, n).proportion_ci(LEVEL, method="wilson")
     return Interval(count / n, float(bounds.low), float(bounds.high), n)
 
 
@@ -81,13 +78,11 @@ def share_interval(count: int, n: int) -> Interval:
 
 def rate_interval(count: int, exposure: float) -> Interval:
     """Return ``count`` / ``exposure`` with the exact Poisson interval (Garwood 1936); n is the count."""
-    from scipy import stats
-
     if not exposure > 0:
         return Interval(np.nan, np.nan, np.nan, count)
     tail = 0.5 * (1.0 - LEVEL)
-    low = stats.chi2.ppf(tail, 2 * count) / 2.0 if count else 0.0
-    high = stats.chi2.ppf(1.0 - tail, 2 * count + 2) / 2.0
+    low = scipy.stats.chi2.ppf(tail, 2 * count) / 2.0 if count else 0.0
+    high = scipy.stats.chi2.ppf(1.0 - tail, 2 * count + 2) / 2.0
     return Interval(count / exposure, float(low / exposure), float(high / exposure), count)
 
 
@@ -119,9 +114,7 @@ class Logistic:
 
     def __call__(self, x: ArrayLike) -> NDArray[np.float64]:
         """Return the share at ``x``."""
-        from scipy.special import expit
-
-        return np.asarray(expit(-self.slope * (np.asarray(x, dtype=np.float64) - self.middle)))
+        return np.asarray(scipy.special.expit(-self.slope * (np.asarray(x, dtype=np.float64) - self.middle)))
 
     def where(self, share: float) -> float:
         """Return the x at which that share succeeds."""
@@ -134,8 +127,6 @@ def logistic_fit(x: ArrayLike, success: ArrayLike) -> Logistic | None:
     A Gaussian prior on the logarithm of the slope, wide by a factor of e^2 about eight over the range of x, keeps
     the fit finite where success and failure do not overlap.
     """
-    from scipy import optimize
-
     at, won = np.asarray(x, dtype=np.float64), np.asarray(success, dtype=np.float64)
     if not len(at) or won.min() == won.max() or at.min() == at.max():
         return None
@@ -149,7 +140,7 @@ def logistic_fit(x: ArrayLike, success: ArrayLike) -> Logistic | None:
         return float(fit.sum() + 0.5 * ((values[1] - np.log(8.0)) / 2.0) ** 2)
 
     start = np.array([float(won.mean()), np.log(8.0)])
-    solution = optimize.minimize(loss, start, method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-6})
+    solution = scipy.optimize.minimize(loss, start, method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-6})
     return Logistic(float(at.min() + span * solution.x[0]), float(np.exp(solution.x[1]) / span))
 
 
@@ -173,8 +164,6 @@ def paired_share_interval(first: ArrayLike, second: ArrayLike) -> Interval:
     Half a robot is added to each of the four outcomes of a pair (Agresti and Min, Statistics in Medicine 24, 2005),
     which avoids intervals of zero width where all pairs agree.
     """
-    from scipy import stats
-
     a, b = np.asarray(first, dtype=bool), np.asarray(second, dtype=bool)
     n = len(a)
     if not n:
@@ -182,7 +171,7 @@ def paired_share_interval(first: ArrayLike, second: ArrayLike) -> Interval:
     gained, lost, all_of = (~a & b).sum() + 0.5, (a & ~b).sum() + 0.5, n + 2.0
     middle = (gained - lost) / all_of
     spread = np.sqrt((gained + lost - (gained - lost) ** 2 / all_of) / all_of**2)
-    half = float(stats.norm.ppf(0.5 + 0.5 * LEVEL) * spread)
+    half = float(scipy.stats.norm.ppf(0.5 + 0.5 * LEVEL) * spread)
     return Interval(float(b.mean() - a.mean()), max(middle - half, -1.0), min(middle + half, 1.0), n)
 
 
@@ -192,8 +181,6 @@ def stratified_mean_interval(values: ArrayLike, strata: ArrayLike) -> Interval:
     For one value per robot under fixed conditions, whose differences are no uncertainty. The variance is pooled over
     the strata; the interval is NaN without variance. ``values`` and ``strata`` are (n,) each.
     """
-    from scipy import stats
-
     each = np.asarray(values, dtype=np.float64).ravel()
     known = np.isfinite(each)
     each, (labels, stratum) = each[known], np.unique(np.asarray(strata).ravel()[known], return_inverse=True)
@@ -206,7 +193,7 @@ def stratified_mean_interval(values: ArrayLike, strata: ArrayLike) -> Interval:
     if not free or np.sqrt(within / free) <= ROUNDING * np.abs(each).max():
         return Interval(estimate, np.nan, np.nan, len(each))
     error = np.sqrt(within / free * (1.0 / sizes).sum()) / len(labels)
-    half = float(stats.t.ppf(0.5 + 0.5 * LEVEL, free) * error)
+    half = float(scipy.stats.t.ppf(0.5 + 0.5 * LEVEL, free) * error)
     return Interval(estimate, estimate - half, estimate + half, len(each))
 
 
@@ -215,11 +202,9 @@ def pairs_needed(difference: ArrayLike) -> int | None:
 
     The normal approximation of a paired test: ((z_level + z_power) sd / mean)^2.
     """
-    from scipy import stats
-
     each = np.asarray(difference, dtype=np.float64).ravel()
     each = each[np.isfinite(each)]
     if len(each) < 2 or each.mean() == 0.0 or constant(each):
         return None
-    z = float(stats.norm.ppf(0.5 + 0.5 * LEVEL) + stats.norm.ppf(POWER))
+    z = float(scipy.stats.norm.ppf(0.5 + 0.5 * LEVEL) + scipy.stats.norm.ppf(POWER))
     return max(2, int(np.ceil((z * each.std(ddof=1) / each.mean()) ** 2)))

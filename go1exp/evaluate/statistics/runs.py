@@ -15,6 +15,7 @@ from functools import cache, lru_cache
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from go1exp.evaluate.statistics.intervals import LEVEL, POWER, Interval, constant, share_interval
@@ -33,9 +34,7 @@ Floats = NDArray[np.float64]
 
 def iqm(values: ArrayLike, axis: int | None = -1) -> Floats:
     """Return the interquartile mean along an axis, or of all values (None), as rliable does: a trimmed mean."""
-    from scipy import stats
-
-    return np.asarray(stats.trim_mean(np.asarray(values, dtype=np.float64), TRIM, axis=axis))
+    return np.asarray(scipy.stats.trim_mean(np.asarray(values, dtype=np.float64), TRIM, axis=axis))
 
 
 def iqm_interval(values: ArrayLike) -> Interval:
@@ -80,10 +79,8 @@ def _standard_error(values: Floats) -> Floats:
 @cache
 def _critical(n: int) -> float:
     """Return the 95 % quantile of |error| / standard error of the interquartile mean of n normal values."""
-    from scipy import stats
-
     if n > 40:
-        return float(stats.t.ppf(0.5 + 0.5 * LEVEL, n - 2 * int(TRIM * n) - 1))
+        return float(scipy.stats.t.ppf(0.5 + 0.5 * LEVEL, n - 2 * int(TRIM * n) - 1))
     sample = np.random.default_rng(n).normal(size=(SIMULATED, n))
     return float(np.quantile(np.abs(iqm(sample)) / _standard_error(sample), LEVEL))
 
@@ -98,8 +95,6 @@ def clustered_share(counts: ArrayLike, totals: ArrayLike) -> Interval:
     Student's quantile of the runs less one (Korn and Graubard 1998, with Wilson's interval). n is that of the runs.
     ``counts`` are the falls of each run (n,), ``totals`` its robots (n,).
     """
-    from scipy import stats
-
     fell, robots = np.asarray(counts, dtype=np.float64), np.asarray(totals, dtype=np.float64)
     fell, robots = fell[robots > 0], robots[robots > 0]
     n, everyone = len(robots), float(robots.sum())
@@ -112,7 +107,7 @@ def clustered_share(counts: ArrayLike, totals: ArrayLike) -> Interval:
     variance = n / (n - 1) * float((residuals**2).sum()) / everyone**2
     alone = share * (1.0 - share) / everyone
     effective = everyone / max(variance / alone, 1.0) if alone > 0.0 else everyone
-    z2 = float(stats.t.ppf(0.5 + 0.5 * LEVEL, n - 1)) ** 2
+    z2 = float(scipy.stats.t.ppf(0.5 + 0.5 * LEVEL, n - 1)) ** 2
     middle = (share + z2 / (2.0 * effective)) / (1.0 + z2 / effective)
     half = np.sqrt(z2 * (share * (1.0 - share) / effective + z2 / (4.0 * effective**2))) / (1.0 + z2 / effective)
     return Interval(share, max(float(middle - half), 0.0), min(float(middle + half), 1.0), n)
@@ -197,15 +192,13 @@ def permutation_p(a: NDArray[np.float64], b: NDArray[np.float64], paired: bool =
     A permutation test of mean ranks (Wilcoxon 1945) over all, or 20,000, permutations of the runs, or within pairs. It
     is exact for any distribution, and robust to single failed runs.
     """
-    from scipy import stats
-
     if min(len(a), len(b)) < 2:
         return math.nan
     if paired:
         gain = a - b
-        signed = stats.rankdata(np.abs(gain)) * np.sign(gain)
+        signed = scipy.stats.rankdata(np.abs(gain)) * np.sign(gain)
         return _p_of_ranks((tuple(np.sort(signed).tolist()),)) if gain.any() else 1.0
-    together = stats.rankdata(np.concatenate([a, b]))
+    together = scipy.stats.rankdata(np.concatenate([a, b]))
     if constant(np.concatenate([a, b])):
         return 1.0
     return _p_of_ranks(tuple(tuple(np.sort(each).tolist()) for each in np.split(together, [len(a)])))
@@ -214,10 +207,8 @@ def permutation_p(a: NDArray[np.float64], b: NDArray[np.float64], paired: bool =
 @lru_cache(maxsize=4096)
 def _p_of_ranks(ranks: tuple[tuple[float, ...], ...]) -> float:
     """Return the p of one sample of signed ranks, or of two samples of ranks; cached, since ranks recur."""
-    from scipy import stats
-
     kind = "samples" if len(ranks) == 1 else "independent"
-    done = stats.permutation_test(
+    done = scipy.stats.permutation_test(
         tuple(map(np.asarray, ranks)),
         _mean_difference,
         permutation_type=kind,
@@ -273,8 +264,6 @@ def yuen(a: NDArray[np.float64], b: NDArray[np.float64], paired: bool = False) -
 
     The interval is NaN where both groups, or the differences of pairs, are constant and the estimate is not zero.
     """
-    from scipy import stats
-
     parts = [a - b] if paired else [a, b]
     n = min(len(part) for part in parts)
     if not n:
@@ -289,7 +278,7 @@ def yuen(a: NDArray[np.float64], b: NDArray[np.float64], paired: bool = False) -
     if paired:
         return iqm_interval(parts[0])
     centred = (part - np.median(part) for part in parts)  # exact for a constant group; only the width is used
-    bounds = stats.ttest_ind(*centred, equal_var=False, trim=trim).confidence_interval(LEVEL)
+    bounds = scipy.stats.ttest_ind(*centred, equal_var=False, trim=trim).confidence_interval(LEVEL)
     shift = estimate - 0.5 * (bounds.low + bounds.high)
     return Interval(estimate, float(bounds.low + shift), float(bounds.high + shift), n)
 
@@ -321,11 +310,9 @@ def runs_needed(a: NDArray[np.float64], b: NDArray[np.float64], alpha: float = A
     The normal approximation for two groups, with a quarter of the squared quantile for Student's: n = (z_alpha +
     z_power)^2 (s_a^2 + s_b^2) / d^2 + z_alpha^2 / 4.
     """
-    from scipy import stats
-
     if min(len(a), len(b)) < 2 or a.mean() == b.mean():
         return None
-    z_alpha, z_power = float(stats.norm.ppf(1.0 - 0.5 * alpha)), float(stats.norm.ppf(POWER))
+    z_alpha, z_power = float(scipy.stats.norm.ppf(1.0 - 0.5 * alpha)), float(scipy.stats.norm.ppf(POWER))
     ratio = (a.var(ddof=1) + b.var(ddof=1)) / (a.mean() - b.mean()) ** 2
     needed = (z_alpha + z_power) ** 2 * ratio + 0.25 * z_alpha**2
     least = runs_for_significance(alpha=alpha)

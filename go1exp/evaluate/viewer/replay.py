@@ -202,11 +202,7 @@ def magnification(pieces: Sequence[Piece]) -> float:
 
 
 def of_result(result: GapResult, where: str) -> Story:
-    """Return the held-out windows of a result that keeps their curves.
-
-    Raises:
-        RecordingError: if it keeps none.
-    """
+    """Return the held-out windows of a result that keeps their curves; raise RecordingError if it keeps none."""
     pieces = tuple(_window(overlay) for overlay in result.overlays if any(n.startswith("q_") for n in overlay.measured))
     if not pieces:
         raise RecordingError(f"{where}: keeps no curves of windows; run go1exp gap again with search.overlays=8")
@@ -234,11 +230,7 @@ def _window(overlay: Overlay) -> Piece:
 
 
 def of_recording(recording: Recording) -> Story:
-    """Return a recording of a Go1 as one piece, with its targets as a second robot.
-
-    Raises:
-        RecordingError: if it is of another robot, or has no angles.
-    """
+    """Return a Go1's recording, targets as a second robot; raise RecordingError of other robots, or without angles."""
     meta = recording.meta
     if set(meta.joints) != set(JOINTS):
         raise RecordingError(f"{meta.episode}: is of the robot {meta.robot!r}; the scene has the Go1's joints alone")
@@ -314,11 +306,7 @@ class ReplayShow:
     """A story in its scene."""
 
     def __init__(self, story: Story, config: RobotConfig, model: mujoco.MjModel | None = None) -> None:
-        """Build the scene: with the Go1, or with the model of another robot, on its base.
-
-        Raises:
-            ValueError: if the model has no such joint.
-        """
+        """Build the scene, with the Go1 or another robot's model on its base; raise ValueError of a missing joint."""
         self.player = Player(story)
         if model is None:
             ground = build_terrain(TerrainConfig(kind="flat"))

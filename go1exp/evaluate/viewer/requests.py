@@ -156,11 +156,7 @@ def _is_active(term: Term) -> bool:
 def active(
     sizes: Mapping[str, float], effects: Mapping[str, Term], actuator: Term, contact: ContactConfig
 ) -> tuple[Term, ...]:
-    """Return the effects of a size above 0, at that size; ``effects`` has all by name, at size 1.
-
-    Raises:
-        ConfigError: if a name is unknown, or effects and actuator are incompatible.
-    """
+    """Return effects of sizes above 0, at that size (``effects``: all at size 1); raise ConfigError of misfits."""
     if strange := [name for name in sizes if name not in effects]:
         raise ConfigError([f"effect {strange[0]!r}: known are {', '.join(effects)}"])
     chosen = {name: size for name, size in sizes.items() if size > 0.0}
@@ -278,11 +274,7 @@ class Setup(Conditions):
 
 
 def task_under(task: TaskConfig, setup: Setup, known: Mapping[str, Ground], effects: Mapping[str, Term]) -> TaskConfig:
-    """Return the task of a policy under ``setup``; the physics step is rounded down to fit the policy's period.
-
-    Raises:
-        ConfigError: if effects and actuator are incompatible, or a name is not known.
-    """
+    """Return a policy's task under ``setup``, the physics step rounded down to fit; raise ConfigError of misfits."""
     if setup.ground not in known:
         raise ConfigError([f"ground = {setup.ground!r}: known are {', '.join(known)}"])
     period = task.sim.policy_dt

@@ -135,11 +135,7 @@ class Session:
     """
 
     def __init__(self, robots: Robots, label: str, setup: Setup, velocity: requests.Velocity) -> None:
-        """Build the robot and reset it to the start.
-
-        Raises:
-            ConfigError: if the policy is incompatible with ``setup``.
-        """
+        """Build the robot and reset it to the start; raise ConfigError if the policy is incompatible with ``setup``."""
         self.robots, self.command = robots, velocity
         self._loaded: dict[str, Agent] = {}
         self.paused, self.speed, self.time, self.falls = False, 1.0, 0.0, 0
@@ -290,11 +286,7 @@ class Session:
         return not self.paused or self._single
 
     def advance(self) -> None:
-        """Simulate one period of the policy.
-
-        Raises:
-            NumericalFault: when a value is not finite.
-        """
+        """Simulate one period of the policy; raise NumericalFault when a value is not finite."""
         self._single, core = False, self.core
         self._aim()
         result = core.step(self._policy(self._observation))

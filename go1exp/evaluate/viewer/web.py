@@ -206,11 +206,7 @@ def _opened(
 
 
 def _refuses_strangers(port: int, host: str) -> None:
-    """Wait for the server and verify that it rejects requests without a token.
-
-    Raises:
-        Expected: if it does not answer, or answers without a token.
-    """
+    """Wait until the server rejects requests without a token; raise Expected if it admits them, or never answers."""
     name = host if host not in ("", "0.0.0.0", "::") else "127.0.0.1"
     address = f"http://{f'[{name}]' if ':' in name else name}:{port}/"
     ends = time.monotonic() + READY_S

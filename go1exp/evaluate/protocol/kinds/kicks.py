@@ -26,8 +26,7 @@ from go1exp.evaluate.protocol.base import (
     repeated,
     rounded,
 )
-from go1exp.evaluate.protocol.plan import Impulses, Motion, Plan
-from go1exp.evaluate.protocol.signals import Signal
+from go1exp.evaluate.protocol.plan import Impulses, Motion, Plan, Signal
 from go1exp.evaluate.quantities import Column, Row
 
 if TYPE_CHECKING:

@@ -15,8 +15,7 @@ from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import Positive, protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Cause, Count, Impulse, Length, Played, Point, Protocol, lives
-from go1exp.evaluate.protocol.plan import Impulses, Motion, Plan
-from go1exp.evaluate.protocol.signals import Signal
+from go1exp.evaluate.protocol.plan import Impulses, Motion, Plan, Signal
 from go1exp.evaluate.quantities import Column, Derived, Row, values
 
 if TYPE_CHECKING:

@@ -15,8 +15,7 @@ from go1exp.config.schema.registry import NonNegative, Positive, protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.controller.types import TrunkVelocity
 from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, lives, repeated
-from go1exp.evaluate.protocol.plan import Motion, Plan
-from go1exp.evaluate.protocol.signals import Signal
+from go1exp.evaluate.protocol.plan import Motion, Plan, Signal
 from go1exp.evaluate.quantities import Column, Derived, Row, values
 
 if TYPE_CHECKING:
