@@ -290,10 +290,8 @@ def _audit(container: dict[str, Any]) -> int:
 AUDIT = App("record_audit", _audit, AuditSettings)
 
 
-NAMED = 3
-"""Most files that a note names."""
-MOST_NOTES = 10
-"""Most notes of recordings that an import prints."""
+NAMED = 3  # most files that a note names
+MOST_NOTES = 10  # most notes of recordings that an import prints
 
 
 def _import(container: dict[str, Any]) -> None:

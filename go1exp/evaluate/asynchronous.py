@@ -21,11 +21,8 @@ from go1exp.config.schema.physics import CpuBackend
 from go1exp.evaluate.rollout import EvalConfig, evaluate, evaluation_task, grid
 from go1exp.train.policy import load_run
 
-FALLEN = 1.0
-"""Least error of a fallen robot, m/s."""
-
-NICE = 19
-"""Lowest priority: the training comes first."""
+FALLEN = 1.0  # least error of a fallen robot, m/s
+NICE = 19  # lowest priority: the training comes first
 
 
 def score(rows: Sequence[dict[str, Any]], duration_s: float) -> float:

@@ -17,11 +17,8 @@ from go1exp import robot
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-SPAN = 2.0
-"""Time that is shown, s; the right edge is now."""
-
-TICK = 0.5
-"""Time between two lines, s."""
+SPAN = 2.0  # time that is shown, s; the right edge is now
+TICK = 0.5  # time between two lines, s
 
 FIRST_RGB, SECOND_RGB = (90, 170, 255), (255, 176, 70)
 """Colours of the diagonal pairs FR with RL, and FL with RR: of a trot one colour at a time is on the ground."""

@@ -30,11 +30,8 @@ Condition = tuple[Any, ...]
 ROBOT = "robot"
 """Column with the robot's number in its condition: the same number is the same robot in all conditions' draws."""
 
-FINGERPRINT = "fingerprint"
-"""Column with a number that two robots share only if they did the same, bit for bit."""
-
-DIGITS = 6
-"""Significant digits in the file."""
+FINGERPRINT = "fingerprint"  # column with a number that two robots share only if they did the same, bit for bit
+DIGITS = 6  # significant digits in the file
 
 
 @dataclass(frozen=True)
@@ -234,11 +231,8 @@ ERRORS = (
 COLUMNS = (FELL, MOVING, *ERRORS)
 """Figures of a row beside its measures."""
 
-KEYS = ("x", "y", "yaw")
-"""Columns that say the command: m/s, m/s, rad/s."""
-
-SEPARATE = 3
-"""A draw of more numbers than these stands as their mean and their range."""
+KEYS = ("x", "y", "yaw")  # columns that say the command: m/s, m/s, rad/s
+SEPARATE = 3  # a draw of more numbers than these stands as their mean and their range
 
 
 def rows_of(

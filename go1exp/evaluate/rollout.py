@@ -305,11 +305,8 @@ def _per_axis(values: torch.Tensor) -> dict[str, float]:
 
 # ---------------------------------------------------------------------- the delay margin
 
-DELAYS_MS = (10, 20, 30, 40)
-"""Further delays of commands that are tried, ms."""
-
-DELAY = "command_delay"
-"""Effect that delays commands."""
+DELAYS_MS = (10, 20, 30, 40)  # further delays of commands that are tried, ms
+DELAY = "command_delay"  # effect that delays commands
 
 
 def delayed(task: TaskConfig, delay: float) -> TaskConfig:

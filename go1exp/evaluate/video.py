@@ -40,23 +40,15 @@ from go1exp.sim.env.camera import (
 from go1exp.sim.env.core import Go1Core
 from go1exp.train.policy import Policy
 
-AVERAGE_TIME = 0.5
-"""Time over which the velocity in the caption is averaged, s: about a gait cycle."""
-
-WIDTH, HEIGHT = 640, 480
-"""Of a picture without a gait diagram, pixels."""
-
-GIF_WIDTH = 320
-"""Of a GIF, pixels."""
+AVERAGE_TIME = 0.5  # time over which the velocity in the caption is averaged, s: about a gait cycle
+WIDTH, HEIGHT = 640, 480  # of a picture without a gait diagram, pixels
+GIF_WIDTH = 320  # of a GIF, pixels
 
 GIF_BYTES = 3 * GIF_WIDTH * GIF_WIDTH * HEIGHT // WIDTH
 """What a picture of a GIF takes in memory, at least: its palette is of all pictures, so all are kept until the end."""
 
-GIF_COLOURS = 128
-"""Colours of a GIF, of at most 256; fewer compress better."""
-
-PANELS = 6
-"""Pictures of a strip."""
+GIF_COLOURS = 128  # colours of a GIF, of at most 256; fewer compress better
+PANELS = 6  # pictures of a strip
 
 
 def record(

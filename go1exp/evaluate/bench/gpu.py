@@ -26,11 +26,8 @@ from go1exp.sim.terrain import build_terrain
 from go1exp.train import trainer
 from go1exp.train.ppo import AdaptivePPO
 
-STEPS = 24
-"""Policy steps between two readings of the clock; each reading waits for the device."""
-
-PAPER_STEPS = 4096 * 24 * 5000
-"""Policy steps in the training of the paper (section III-A)."""
+STEPS = 24  # policy steps between two readings of the clock; each reading waits for the device
+PAPER_STEPS = 4096 * 24 * 5000  # policy steps in the training of the paper (section III-A)
 
 
 def gpu() -> str:

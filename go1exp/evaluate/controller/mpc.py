@@ -23,10 +23,8 @@ from go1exp.sim.physics.dynamics import Kinematics
 
 LIMIT = robot.per_joint(robot.EFFORT_LIMIT)
 LOW, HIGH = robot.JOINT_POS_LIMITS.T
-MOST_CHANGE = 0.6
-"""Largest difference between a target and the joint's angle, rad."""
-MOST_SPEED = 25.0
-"""Largest commanded joint velocity of a swinging leg, rad/s."""
+MOST_CHANGE = 0.6  # largest difference between a target and the joint's angle, rad
+MOST_SPEED = 25.0  # largest commanded joint velocity of a swinging leg, rad/s
 
 
 STANDING = LowCmd(

@@ -27,20 +27,11 @@ UNITS: dict[str, str] = {
 RUN_UP, COURSE, RUN_OUT, WIDTH = 1.5, 5.0, 2.5, 5.0
 """m. The run-out is longer than the metre before the edge of the map at which an episode ends."""
 
-BEFORE = 2.0
-"""Flat ground behind the start, m."""
-
-RESOLUTION = 0.05
-"""Pitch of the samples, m: that of the gravel."""
-
-TREAD = 0.31
-"""Depth of a stair, m (legged_gym)."""
-
-WAVE_LENGTH = 1.0
-"""m."""
-
-BOX = 0.45
-"""Edge of a box, m (Isaac Lab)."""
+BEFORE = 2.0  # flat ground behind the start, m
+RESOLUTION = 0.05  # pitch of the samples, m: that of the gravel
+TREAD = 0.31  # depth of a stair, m (legged_gym)
+WAVE_LENGTH = 1.0  # m
+BOX = 0.45  # edge of a box, m (Isaac Lab)
 
 Field = NDArray[Any]
 

@@ -23,12 +23,8 @@ from go1exp.evaluate.statistics.runs import ORDER as COMPARED
 Entry = Mapping[str, Any]
 Meanings = Mapping[str, tuple[str, str]]
 
-ACROSS = 5
-"""Most columns of quantities in a table, so that it fits on paper."""
-
-MANY = 8
-"""Largest number of conditions that are columns; more are rows."""
-
+ACROSS = 5  # most columns of quantities in a table, so that it fits on paper
+MANY = 8  # largest number of conditions that are columns; more are rows
 COMMAND = ("x", "y", "yaw")
 
 KEYS: dict[str, tuple[str, str]] = {

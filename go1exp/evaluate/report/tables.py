@@ -33,11 +33,8 @@ COMPARED = (
     " same robots: difference of these policies robot by robot, mean and interval over robots."
 )
 
-MOST_KEYS = 5
-"""Settings of groups that have columns of their own; more are in the CSV file."""
-
-MOST_COLUMNS = 6
-"""Columns of the table of quantities."""
+MOST_KEYS = 5  # settings of groups that have columns of their own; more are in the CSV file
+MOST_COLUMNS = 6  # columns of the table of quantities
 
 SOURCES = {"setting": "swept", "drawn": "randomised"}
 """Source of a sensitivity -> its word."""

@@ -110,13 +110,9 @@ def write(made: Report, folder: Path) -> list[Path]:
     return files
 
 
-FEW = 6
-"""Largest number of groups that are all drawn with bands; of more, only the baseline's band is drawn."""
-
+FEW = 6  # largest number of groups that are all drawn with bands; of more, only the baseline's band is drawn
 STYLES = ("-", "--", ":", "-.")
-
-MOST = 12
-"""Quantities of a sensitivity that are drawn."""
+MOST = 12  # quantities of a sensitivity that are drawn
 
 
 def short(name: str, letters: int) -> str:

@@ -11,17 +11,10 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-RESAMPLES = 9_999
-"""Most permutations of a test."""
-
-FOLDS = 5
-"""Folds of the cross-validation."""
-
-SHUFFLES = 20
-"""Permutations of a quantity for its importance."""
-
-LARGE = 500
-"""Largest number of values with a permutation test; more are tested by Student's approximation."""
+RESAMPLES = 9_999  # most permutations of a test
+FOLDS = 5  # folds of the cross-validation
+SHUFFLES = 20  # permutations of a quantity for its importance
+LARGE = 500  # largest number of values with a permutation test; more are tested by Student's approximation
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,8 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 LEVEL = 0.95
-
-POWER = 0.8
-"""Probability of detecting a difference, of sample sizes."""
-
-ROUNDING = 1e-9
-"""Relative variation below which values are constant."""
+POWER = 0.8  # probability of detecting a difference, of sample sizes
+ROUNDING = 1e-9  # relative variation below which values are constant
 
 
 @dataclass(frozen=True)

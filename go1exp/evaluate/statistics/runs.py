@@ -20,14 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from go1exp.evaluate.statistics.intervals import LEVEL, POWER, Interval, constant, share_interval
 
-TRIM = 0.25
-"""Share of the values that the interquartile mean omits at each end."""
-
-WINSORISED_FROM = 6
-"""Least number of runs with a winsorised standard error."""
-
-SIMULATED = 40_000
-"""Normal samples for a critical value, which is then accurate to 1 %."""
+TRIM = 0.25  # share of the values that the interquartile mean omits at each end
+WINSORISED_FROM = 6  # least number of runs with a winsorised standard error
+SIMULATED = 40_000  # normal samples for a critical value, which is then accurate to 1 %
 
 Floats = NDArray[np.float64]
 

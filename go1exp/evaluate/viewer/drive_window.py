@@ -42,15 +42,9 @@ KEYS = {
 PUSH_KEY = imgui.Key.P
 
 AXES = ("forward m/s", "left m/s", "yaw rad/s")
-
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0)
-
-RATES = (None, 0.001, 0.002, 0.004, 0.005)
-"""Physics steps to choose from, s; None is that of training."""
-
-MOST_BUTTONS = 6
-"""Number of policies up to which each has a button; more are a list."""
-
+RATES = (None, 0.001, 0.002, 0.004, 0.005)  # physics steps to choose from, s; None is that of training
+MOST_BUTTONS = 6  # number of policies up to which each has a button; more are a list
 VELOCITIES = ("exact", "estimated")
 
 HELP = ("arrows: forward, back, yaw", "comma, full stop: left, right", "0 zero, P push, space pause")

@@ -84,11 +84,8 @@ class History:
         return self.series(name)[-max(1, round(seconds / self.dt)) :]
 
 
-PUSH_S = 0.1
-"""Duration of a push, s."""
-
-PUSH_SHOWN_S = 0.6
-"""Time for which its arrow is shown, s."""
+PUSH_S = 0.1  # duration of a push, s
+PUSH_SHOWN_S = 0.6  # time for which its arrow is shown, s
 
 Vector = NDArray[np.float64]
 

@@ -33,13 +33,9 @@ from go1exp.evaluate.viewer.session import PushMade, one_push
 
 Array = NDArray[np.float64]
 
-EVERY = 5
-"""Ticks from row to row."""
-
+EVERY = 5  # ticks from row to row
 ROW_S = EVERY * TICK
-
-KEPT_S = 2.0
-"""Time that is kept for a page that does not ask, s; older rows are a gap in its curves."""
+KEPT_S = 2.0  # time that is kept for a page that does not ask, s; older rows are a gap in its curves
 
 TRUTH, TORQUE, FORCE = slice(0, 13), slice(13, 25), slice(25, 29)
 """Columns of a row: the trunk's truth (``server.TRUTH``), torques, N m, and forces under the feet, N."""

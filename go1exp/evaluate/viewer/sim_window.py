@@ -217,14 +217,9 @@ def in_trunk(truth: dict[str, Array]) -> tuple[Array, Array]:
     return forward, left
 
 
-PACKETS = 150.0
-"""Height of the plot of intervals, pixels."""
-
-LEAST_MS = 5.0
-"""The axis of the intervals reaches at least as far, ms."""
-
-BEHIND_S = 0.001
-"""Time behind real time from which the panel reports it, s."""
+PACKETS = 150.0  # height of the plot of intervals, pixels
+LEAST_MS = 5.0  # the axis of the intervals reaches at least as far, ms
+BEHIND_S = 0.001  # time behind real time from which the panel reports it, s
 
 
 class SimWindow(Window):

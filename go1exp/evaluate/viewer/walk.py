@@ -16,26 +16,16 @@ from go1exp.evaluate.viewer.requests import Ground, Setup, lines
 from go1exp.evaluate.viewer.session import PUSH_SHOWN_S, Session
 from go1exp.sim.env.camera import ARROW_SCALE, COMMAND_RGB, LEAST_DRAWN, MEASURED_RGB, VELOCITY_TIME, Stage
 
-VIEWS_PER_S = 25.0
-"""Rate at which the panels get new curves, Hz."""
-
-PAUSED_S = 0.02
-"""Time between two calls while paused, s."""
+VIEWS_PER_S = 25.0  # rate at which the panels get new curves, Hz
+PAUSED_S = 0.02  # time between two calls while paused, s
 
 PUSH_RGB, PUSH_SCALE = (1.0, 0.35, 0.2), 0.012
 """Colour of the arrow of a push; its length per impulse, m / (N s)."""
 
-FALLBACK = ((-1.5, 2.0), (-1.0, 1.0), (-1.5, 1.5))
-"""Range of the sliders of a run without trained ranges."""
-
-RANGES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
-"""Parameters of a command term that are ranges of velocity."""
-
-CURVE_POINTS = 250
-"""Points of a curve: about one a pixel."""
-
-SPARK_POINTS = 100
-"""Points of a reward's small curve."""
+FALLBACK = ((-1.5, 2.0), (-1.0, 1.0), (-1.5, 1.5))  # range of the sliders of a run without trained ranges
+RANGES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")  # parameters of a command term that are ranges of velocity
+CURVE_POINTS = 250  # points of a curve: about one a pixel
+SPARK_POINTS = 100  # points of a reward's small curve
 
 Vector = NDArray[np.float64]
 Series = list[list[float]]

@@ -25,17 +25,10 @@ from go1exp.evaluate.viewer.requests import Ended
 FRAME_S = 1.0 / 33.0
 """Shortest frame period, s. A browser requests up to 60 frames per second, and each draws all panels."""
 
-SLOWEST_FRAME_S = 0.1
-"""Longest frame period, of a computer that cannot keep real time, s."""
-
-DECISION_S = 1.0
-"""Period of the adaptation of the frame period, s."""
-
-LOST_SHARE = 0.02
-"""Share of real time that the simulation may lose before the frame period grows."""
-
-LONGER, SHORTER = 1.3, 0.95
-"""Factors of the frame period with and without lost time."""
+SLOWEST_FRAME_S = 0.1  # longest frame period, of a computer that cannot keep real time, s
+DECISION_S = 1.0  # period of the adaptation of the frame period, s
+LOST_SHARE = 0.02  # share of real time that the simulation may lose before the frame period grows
+LONGER, SHORTER = 1.3, 0.95  # factors of the frame period with and without lost time
 
 
 class PictureRate:
@@ -73,11 +66,8 @@ except ImportError as error:
         "pip install 'mujoco>=4'"
     ) from None
 
-READY_S = 20.0
-"""Longest time until the server answers, s."""
-
-LAG_S = 0.1
-"""Delay behind real time from which it is not made up, s."""
+READY_S = 20.0  # longest time until the server answers, s
+LAG_S = 0.1  # delay behind real time from which it is not made up, s
 
 
 @dataclass(frozen=True)

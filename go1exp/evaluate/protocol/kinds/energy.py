@@ -28,14 +28,9 @@ from go1exp.mdp.measures.trace import Trace, mean_over
 if TYPE_CHECKING:
     from go1exp.evaluate.protocol.stage import Stage
 
-SATURATED = 0.99
-"""Share of the peak torque from which on an actuator counts as saturated."""
-
-POINTS = 1500
-"""Most dots of one kind of joint in the scatter."""
-
-PROTECTED_AT = 100.0
-"""Power of one level of the SDK's PowerProtect, W."""
+SATURATED = 0.99  # share of the peak torque from which on an actuator counts as saturated
+POINTS = 1500  # most dots of one kind of joint in the scatter
+PROTECTED_AT = 100.0  # power of one level of the SDK's PowerProtect, W
 
 POWER = (
     Column("power_p99", "W", "sum over joints of |tau qd|, 99th percentile over steps", better="lower"),

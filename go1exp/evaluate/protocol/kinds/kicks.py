@@ -32,18 +32,10 @@ from go1exp.evaluate.quantities import Column, Row
 if TYPE_CHECKING:
     from go1exp.evaluate.protocol.stage import Stage
 
-COARSE = 0.04
-"""Period of the paper's plot, 25 Hz, s."""
-
-PEAK_WITHIN = 1.0
-"""Time after a kick in which its largest speed is looked for, s."""
-
-BEFORE = 2.0
-"""Time before a kick whose mean is the height and velocity to come back to, s."""
-
-
-LEAST = 2.0
-"""Shortest time before a kick, s."""
+COARSE = 0.04  # period of the paper's plot, 25 Hz, s
+PEAK_WITHIN = 1.0  # time after a kick in which its largest speed is looked for, s
+BEFORE = 2.0  # time before a kick whose mean is the height and velocity to come back to, s
+LEAST = 2.0  # shortest time before a kick, s
 
 
 @settings

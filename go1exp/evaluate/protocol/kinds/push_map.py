@@ -23,17 +23,10 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-LONGEST_STRIDE = 0.6
-"""Time after the start in which two touchdowns of FR are looked for, twice, s."""
-
-LEAST_SWING = 0.05
-"""s."""
-
-GUESS = 0.36
-"""Stride of a robot that shows none, s."""
-
-LEAST_SETTLE, LEAST_WATCH = 1.0, 0.5
-"""Shortest times before and after a kick, s."""
+LONGEST_STRIDE = 0.6  # time after the start in which two touchdowns of FR are looked for, twice, s
+LEAST_SWING = 0.05  # s
+GUESS = 0.36  # stride of a robot that shows none, s
+LEAST_SETTLE, LEAST_WATCH = 1.0, 0.5  # shortest times before and after a kick, s
 
 
 @protocol("push_map")

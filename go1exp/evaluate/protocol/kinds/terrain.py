@@ -24,11 +24,8 @@ if TYPE_CHECKING:
 
 SHARES = {"at_half": 0.5, "at_95": 0.95}
 
-LEAST_SLACK = 1.0
-"""Of the time at the commanded speed: less is too little for every robot."""
-
-START_S = 1.0
-"""Time that a robot has beside it, to begin, s."""
+LEAST_SLACK = 1.0  # of the time at the commanded speed: less is too little for every robot
+START_S = 1.0  # time that a robot has beside it, to begin, s
 
 
 @protocol("terrain")
