@@ -48,12 +48,7 @@ class App:
         return f"go1exp {self.name.replace('_', ' ')}"
 
     def run(self, arguments: Sequence[str]) -> int:
-        """Run with command-line arguments; return the exit status.
-
-        Raises:
-            ConfigError: if the settings are refused.
-            Exception: what the task raises.
-        """
+        """Run with arguments; return the exit status; raise ConfigError of wrong settings, and what the task raises."""
         defer("torch")
         warnings.filterwarnings("ignore", message="The `render_mode` attribute is not defined")
         status: list[int | None] = []
@@ -276,19 +271,10 @@ Reader = Callable[[Any], Any]
 def parse_with_groups(
     kind: type[T], container: Mapping[str, Any], groups: Sequence[str], **others: Reader
 ) -> tuple[T, dict[str, Any]]:
-    """Validate a verb's settings together with its groups.
+    """Return a verb's settings of class ``kind``, and by key what was read of its groups and further keys.
 
-    Args:
-        kind: the class of the settings.
-        container: the composed configuration.
-        groups: groups of ``go1exp.sim.task`` that the verb has.
-        **others: for each further key the function that reads it.
-
-    Returns:
-        The settings, and what was read of groups and further keys, by key.
-
-    Raises:
-        ConfigError: with every problem of all of them.
+    ``groups`` are those of ``go1exp.sim.task``; ``others`` are functions that read further keys. Raise ConfigError with
+    every problem of all of them.
     """
     from go1exp.sim.task import parse_parts
 

@@ -112,14 +112,9 @@ GRID_ONLY = (
 
 
 def chosen_protocols(container: dict[str, Any], plain: dict[str, Any]) -> tuple[list[Chosen], bool]:
-    """Return the protocols of a configuration, and whether the grid is among them.
+    """Return the protocols of a configuration, and whether the grid is one; raise ConfigError with every problem.
 
-    Args:
-        container: the configuration.
-        plain: ``conf/eval.yaml`` as it stands, to see which keys have been changed.
-
-    Raises:
-        ConfigError: with every problem; also for keys of the grid where it is not played.
+    ``plain`` is ``conf/eval.yaml`` as it stands: changed keys of the grid are a problem where it is not played.
     """
     import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
     from go1exp.evaluate.protocol.base import chosen as checked
@@ -153,13 +148,7 @@ def refuse(protocols: Sequence[Chosen], agent: Agent) -> None:
 
 
 def refuse_rates(protocols: Sequence[Chosen], controller: str | None, policy_dt: float | None) -> None:
-    """Raise ConfigError where the rates of a policy cannot be varied.
-
-    Args:
-        protocols: what is to be played.
-        controller: name of another controller with a rate of its own, or None.
-        policy_dt: the period of the policy in place of that of training, s, or None.
-    """
+    """Raise ConfigError where rates cannot vary: of a ``controller`` with its own, or with another ``policy_dt``, s."""
     kinds = [c.kind for c in protocols]
     if controller is not None and set(kinds) == {RATES}:
         raise ConfigError([f"protocol={RATES}: varies the rate of a policy; {controller} has one of its own"])

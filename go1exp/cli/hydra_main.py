@@ -149,15 +149,9 @@ def run(
 ) -> int | None:
     """Compose ``conf/<verb>.yaml`` with Hydra's command line and call ``task`` with each job's configuration.
 
-    Args:
-        verb: name of the configuration.
-        argv: title and arguments.
-        folders: the user's folders of choices.
-        task: gets the composed configuration; must not raise.
-        on_sweep: runs a sweep in place of Hydra's sweeper; returns the exit status.
-
-    Returns:
-        the exit status of the work for which Hydra was left; None if it was not left.
+    ``argv`` are title and arguments, ``folders`` the user's folders of choices; ``task`` must not raise. ``on_sweep``
+    runs a sweep in place of Hydra's sweeper. Return the exit status of work for which Hydra was left, None if it was
+    not left.
     """
     before = os.environ.get("HYDRA_FULL_ERROR")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises, in place of a report and an exit
@@ -203,10 +197,8 @@ ITEM = re.compile(r"'(?:\\.|[^'])*'|\"(?:\\.|[^\"])*\"|[^\[\],]+")
 def choices_from_files(arguments: Sequence[str], verb: str) -> list[str]:
     """Return the arguments with every ``group=FILE.yaml`` turned into a choice that Hydra knows.
 
-    A list may mix files and names: ``effect=[mine.yaml,payload]``. Quotes round a path are taken off.
-
-    Raises:
-        ConfigError: if a file is missing, empty, no YAML or no mapping, or a choice is there twice; with each of them.
+    A list may mix files and names: ``effect=[mine.yaml,payload]``. Quotes round a path are taken off. Raise ConfigError
+    with every file that is missing, empty, no YAML or no mapping, and every choice that is there twice.
     """
     chosen: list[str] = []
     problems: list[str] = []

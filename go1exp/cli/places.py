@@ -36,16 +36,10 @@ def shipped_policies() -> dict[str, Path]:
 
 
 def trained(run: str | None, policy: str | None, file: str, out: str | None) -> tuple[Path, Path]:
-    """Return the folder of the run or of the shipped policy that is meant, and the file that results go to.
+    """Return the folder of the run or shipped policy that is meant, and the file for results: ``out``, or ``file``.
 
-    Args:
-        run: run folder.
-        policy: name of a shipped policy, in its place.
-        file: what the results are called, in the run folder; those of a shipped policy go to the present one.
-        out: the user's own file.
-
-    Raises:
-        ConfigError: unless there is exactly one of the two, or if ``out`` cannot be the name of a file.
+    That is in the run folder, or of a shipped policy in the present one. Raise ConfigError unless just one of ``run``
+    and ``policy`` is given, or if ``out`` cannot be the name of a file.
     """
     if run is None and policy is None:
         raise ConfigError(["run: required, such as run=runs/NAME, or a shipped policy, such as policy=paper"])
@@ -138,10 +132,8 @@ def long_enough(recordings: list[Recording], least: float) -> list[Recording]:
 def read_all(places: str | Sequence[str]) -> list[Recording]:
     """Read the recordings of folders and files, each under a name of its own.
 
-    Recordings of one name are named after their folders, too (``day1/run_0``), in one folder after their files.
-
-    Raises:
-        go1exp.logs.recording.RecordingError: if one is missing or damaged, or given twice, also as a copy.
+    Recordings of one name are named after their folders, too (``day1/run_0``), in one folder after their files. Raise
+    RecordingError if one is missing or damaged, or given twice, also as a copy.
     """
     from go1exp.logs.recording import RecordingError, read
 

@@ -118,16 +118,7 @@ def walk(
     settings: PlaySettings,
     where: tuple[str, int],
 ) -> None:
-    """Show a robot that walks, until Ctrl-C.
-
-    Args:
-        subject: what drives first.
-        other: choices of another robot (``subjects.split_robot``).
-        ground: to walk on; None takes that of the settings.
-        engine: physics engine.
-        settings: of the verb.
-        where: to listen, host and port.
-    """
+    """Show a robot that ``subject`` drives first, until Ctrl-C; without a ``ground`` on that of the settings."""
     require_studio()
     from go1exp.base.tensors.threads import one_thread
 
@@ -200,16 +191,7 @@ def _sim_page(
     seconds: float | None,
     where: tuple[str, int],
 ) -> None:
-    """Show the simulated robot that a client drives, until Ctrl-C.
-
-    Args:
-        body: what is simulated.
-        groups: the configuration that it is made of, as plain data.
-        config: how it is set up.
-        robot_at: where it listens for its client, host and port.
-        seconds: how long it runs, s; None until Ctrl-C.
-        where: to serve the page, host and port.
-    """
+    """Show the robot that a client drives at ``robot_at``, for ``seconds`` or until Ctrl-C, on a page at ``where``."""
     require_studio()
     from go1exp.base.tensors.threads import one_thread
     from go1exp.deploy.sim_robot.alone import greeting
@@ -246,14 +228,7 @@ def log(file: Path, where: tuple[str, int]) -> None:
 
 
 def gap(folder: Path, robot: Robot, config: RobotConfig, where: tuple[str, int]) -> None:
-    """Show the answer of ``go1exp gap`` in a folder, until Ctrl-C.
-
-    Args:
-        folder: with the answer.
-        robot: that it is about.
-        config: of the Go1, if it is one.
-        where: to listen, host and port.
-    """
+    """Show the answer of ``go1exp gap`` in a folder about a robot, which may be a Go1 of this configuration."""
     require_studio()
     from go1exp.gap import files
     from go1exp.robot import JOINTS

@@ -80,12 +80,7 @@ CONDITIONS = "paper"
 
 
 def chosen_controller(given: Any) -> MpcSettings | None:
-    """Return the settings of another controller than a policy, from a verb's group ``controller``; None for a policy.
-
-    Raises:
-        ConfigError: with every problem of the settings.
-        go1exp.evaluate.controller.forces.SolverError: if the controller's solver is not installed.
-    """
+    """Return the settings of a controller other than a policy, None for a policy; raise ConfigError or SolverError."""
     settings = parse_controller({"name": "policy"} if given is None else given)
     if not isinstance(settings, MpcSettings):
         return None
@@ -141,11 +136,7 @@ class Named:
 
 
 def driven(controller: MpcSettings, run: str | None, policy: str | None, bundle: str | None, file: str) -> Named:
-    """Return the subject that another controller is, on the robot of a run or shipped policy.
-
-    Raises:
-        ConfigError: if that is not there, or a bundle is named.
-    """
+    """Return a controller as a subject, on the robot of a run or shipped policy; raise ConfigError of a bundle."""
     if bundle is not None:
         raise ConfigError([f"bundle = {bundle!r}: is a policy; controller=mpc takes none"])
     folder, results = controlled(run, policy, file, None)
@@ -153,24 +144,14 @@ def driven(controller: MpcSettings, run: str | None, policy: str | None, bundle:
 
 
 def subject_of(settings: Any, controller: MpcSettings | None, file: str) -> Named:
-    """Return the subject of a verb's keys run, policy, bundle and checkpoint; errors as ``named``'s and ``driven``'s.
-
-    Args:
-        settings: of the verb.
-        controller: that moves the robot in place of a policy, or None.
-        file: what the results are called.
-    """
+    """Return the subject of a verb's keys; ``file`` is what its results are called; errors as those below."""
     if controller is None:
         return named(settings.run, settings.policy, settings.bundle, settings.checkpoint, file)
     return driven(controller, settings.run, settings.policy, settings.bundle, file)
 
 
 def named(run: str | None, policy: str | None, bundle: str | None, checkpoint: str | None, file: str) -> Named:
-    """Return the subject of three keys of which one is given; ``file`` is what its results are called.
-
-    Raises:
-        ConfigError: unless there is exactly one, or if it is not there.
-    """
+    """Return the subject of the one key that is given, its results called ``file``; raise ConfigError of none."""
     if bundle is None:
         folder, out = trained(run, policy, file, None)
         return Named(policy or folder.name, out, run=folder, checkpoint=checkpoint_file(folder, checkpoint))
@@ -208,11 +189,7 @@ class Variation:
 
 
 def varied(given: str, file: str) -> tuple[Named, Variation]:
-    """Return the subject of a word such as clock, mpc, clock@100hz, runs/NAME@estimated, clock@100hz@physx.
-
-    Raises:
-        ConfigError: if it is not there, or is varied in a way that is not known.
-    """
+    """Return the subject of a word such as clock, mpc, runs/NAME@estimated, clock@100hz@physx; raise ConfigError."""
     name, *changes = given.split("@")
     if not name:
         raise ConfigError([f"subjects: {given!r}: names no policy before @, as paper{given} does"])
@@ -255,16 +232,9 @@ def word(given: str, file: str) -> Named:
 
 
 def agent(subject: Named, other: dict[str, Any], robot_of: TaskConfig | None = None) -> Agent:
-    """Load what drives the robots.
+    """Load what drives the robots, with choices of another robot (``split_robot``), or with the robot of a task.
 
-    Args:
-        subject: what drives.
-        other: choices of another robot (``split_robot``).
-        robot_of: the task whose robot, actuators, effects, contact and randomisation are taken; None takes its own.
-
-    Raises:
-        ConfigError: if a run's configuration is not one that this version knows.
-        go1exp.deploy.runtime.bundle.BundleError: if a bundle is damaged or was changed.
+    Raise ConfigError of a configuration that this version does not know, and BundleError of a damaged bundle.
     """
     from go1exp.evaluate.agents import BundleAgent, ControllerAgent, PolicyAgent
 

@@ -65,14 +65,7 @@ def leave_to_go_on(rules: Rules, app: App, folder: str, overrides: Sequence[str]
 def begin(rules: Rules, app: App, folders: Sequence[Path], asked: hydra_main.Sweep) -> int:
     """Check every job, write the sweep's folder, run the jobs; return the exit status.
 
-    Args:
-        rules: of the verb.
-        app: the verb.
-        folders: the user's folders of choices.
-        asked: the sweep.
-
-    Raises:
-        ConfigError: with every problem of every job, each with the first job that has it; then no folder is left.
+    Raise ConfigError with every problem of every job, each with the first job that has it; then no folder is left.
     """
     from go1exp.train import run_state
     from go1exp.train.sweep import index, launchers
@@ -100,16 +93,8 @@ def begin(rules: Rules, app: App, folders: Sequence[Path], asked: hydra_main.Swe
 def go_on(rules: Rules, app: App, folder: Path, overrides: list[str], launcher: dict[str, Any] | None) -> int:
     """Run the jobs of a sweep that are not done; return the exit status.
 
-    Args:
-        rules: of the verb.
-        app: the verb.
-        folder: the sweep's.
-        overrides: for every job; what a resumed run may change.
-        launcher: None takes the one that ran the sweep last.
-
-    Raises:
-        ConfigError: if an override changes what it may not, or a job cannot run here.
-        Expected: if there is no sweep in ``folder``.
+    ``overrides`` are for every job; ``launcher`` None takes the one that ran the sweep last. Raise ConfigError if an
+    override changes what it may not, or a job cannot run here, and Expected without a sweep in ``folder``.
     """
     from go1exp.train import run_state
     from go1exp.train.sweep import index, launchers

@@ -97,15 +97,9 @@ class TrainJob:
 
 
 def resolved(container: dict[str, Any], overrides: list[str], run: Path) -> TrainJob:
-    """Return the training that a composed configuration stands for; touches no file.
+    """Return the training that a composed configuration stands for, in ``run`` unless it resumes; touches no file.
 
-    Args:
-        container: the configuration.
-        overrides: what was given on the command line.
-        run: the folder that Hydra has for it; a resumed run keeps its own.
-
-    Raises:
-        ConfigError: with everything that is wrong.
+    Raise ConfigError with everything that is wrong.
     """
     from go1exp.sim.task import parse_train
 

@@ -92,15 +92,10 @@ class VelocityFilters:
     """One Kalman filter for each robot of an environment, updated with its sensors in every physics step."""
 
     def __init__(self, core: Go1Core, noise: bool, seed: int) -> None:
-        """Observe the plant of ``core``, which must have been built with ``imu=True``, from its next step on.
+        """Observe the plant of ``core``, built with ``imu=True``; raise EstimatorError if the filter is not built.
 
-        Args:
-            core: the environment.
-            noise: add the sensor noise of the paper's Table II, and a logger's to accelerometer and feet.
-            seed: seed of the noise.
-
-        Raises:
-            go1exp.deploy.estimation.EstimatorError: if the filter is not built.
+        ``noise`` adds the sensor noise of the paper's Table II, and a logger's to accelerometer and feet, drawn by
+        ``seed``.
         """
         self._filters = Filters(core.num_envs)
         self._plant, self._dt, self._steps = core.plant, core.task.sim.physics_dt, 0

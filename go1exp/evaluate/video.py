@@ -66,21 +66,11 @@ def record(
 ) -> Iterator[Picture]:
     """Reset the environments, run the policy, and yield the pictures (``length``) of one of them, one by one.
 
-    Args:
-        core: the environments; all of them run.
-        policy: gives the actions.
-        seconds: simulated time to record, s; if an episode ends within it, the next one follows.
-        env: index of the environment.
-        fps: pictures per simulated second.
-        on_frame: called with the progress: pictures done, pictures in all.
-        caption: write time, command and velocity (mean over 0.5 s) on the picture.
-        footfalls: draw a gait diagram of the last 2 s under the picture, which is then higher.
-        width: of the picture, pixels.
-        height: of the picture without the diagram, pixels.
-
-    Raises:
-        RenderingUnavailable: at once, if there is nothing to draw with.
-        NumericalFault: while iterating, when a value is not finite.
+    ``seconds`` are simulated, with ``fps`` pictures each; where an episode ends, the next one follows. ``on_frame``
+    gets the numbers of pictures done and of all. ``caption`` writes time, command and velocity (mean over 0.5 s) on
+    pictures of ``width`` by ``height`` pixels, and ``footfalls`` adds a gait diagram of the last 2 s below. Raise
+    RenderingUnavailable at once without anything to draw with, and NumericalFault while iterating when a value is not
+    finite.
     """
     camera = Camera(core, width, height)  # here, not in the generator, so that errors are raised before it starts
     diagram = Footfalls(core.task.sim.policy_dt) if footfalls else None
@@ -141,11 +131,9 @@ def keeping(frames: Iterable[Picture], total: int, kept: list[Picture], count: i
 
 
 def write_mp4(path: Path, frames: Iterable[Picture], fps: float = 25) -> None:
-    """Write an H.264 video that browsers play; the frames are consumed one by one.
+    """Write an H.264 video that browsers play, frame by frame; no partial file is left.
 
-    Raises:
-        OSError: if it cannot be written; no partial file is left.
-        ValueError: if there are no frames.
+    Raise OSError if it cannot be written, and ValueError without frames.
     """
     frames = iter(frames)
     first = next(frames, None)
@@ -161,11 +149,9 @@ def write_mp4(path: Path, frames: Iterable[Picture], fps: float = 25) -> None:
 
 
 def write_strip(path: Path, frames: Sequence[Picture], count: int = PANELS, size: int = 320) -> None:
-    """Write ``count`` evenly spaced frames side by side as one PNG, each cropped to its middle, ``size`` pixels high.
+    """Write ``count`` evenly spaced frames side by side as a PNG, cropped to squares of ``size`` pixels.
 
-    Raises:
-        OSError: if it cannot be written.
-        ValueError: if there are no frames.
+    Raise OSError if it cannot be written, and ValueError without frames.
     """
     if not len(frames):
         raise ValueError(f"{path}: a strip needs at least one frame")
@@ -186,11 +172,7 @@ def write_strip(path: Path, frames: Sequence[Picture], count: int = PANELS, size
 def write_gif(path: Path, frames: Iterable[Picture], fps: float = 12, width: int = GIF_WIDTH) -> None:
     """Write a small looping GIF of frames that are ``fps`` apart (every second one of a video at 25 is about 12).
 
-    Keeps ``GIF_BYTES`` or more of each in memory.
-
-    Raises:
-        OSError: if it cannot be written.
-        ValueError: if there are no frames.
+    Keeps ``GIF_BYTES`` or more of each in memory. Raise OSError if it cannot be written, and ValueError without frames.
     """
     small = [Image.fromarray(f).resize((width, round(width * f.shape[0] / f.shape[1]))) for f in frames]
     if not small:
@@ -263,9 +245,7 @@ def steer(command: list[float], key: int) -> None:
 def live(core: Go1Core, policy: Policy, env: int = 0) -> None:
     """Show one environment in a window in real time until it is closed; the keyboard sets the command.
 
-    Raises:
-        RenderingUnavailable: if there is no display.
-        NumericalFault: when a value is not finite.
+    Raise RenderingUnavailable without a display, and NumericalFault when a value is not finite.
     """
     command = core.command.value[env].tolist()
     stage, dt = Stage(core), core.task.sim.policy_dt

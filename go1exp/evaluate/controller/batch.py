@@ -44,18 +44,11 @@ class Driven:
         seed: int,
         trunk_velocity: TrunkVelocity = "exact",
     ) -> None:
-        """Control the robots of ``core``, which must have been built with ``imu=True``.
+        """Control the robots of ``core``, built with ``imu=True``, by their commands (``core.command.value``).
 
-        Args:
-            core: the environment; its commands (``core.command.value``) are those of the robots.
-            make: makes one robot's controller.
-            noise: add the sensor noise of the paper's Table II, and a logger's to the feet.
-            seed: of the noise.
-            trunk_velocity: the true one, or that of the Kalman filter.
-
-        Raises:
-            ConfigError: if the controller's period is no multiple of the physics step.
-            go1exp.deploy.estimation.EstimatorError: if the filter is wanted and not built.
+        ``make`` makes one robot's controller. ``noise`` adds the sensor noise of the paper's Table II, and a logger's
+        to the feet, drawn by ``seed``. Raise ConfigError if the controller's period is no multiple of the physics step,
+        and EstimatorError if ``trunk_velocity`` is to be estimated and the filter is not built.
         """
         self._core, self._plant, n = core, core.plant, core.num_envs
         self.controllers: list[Controller] = [make() for _ in range(n)]

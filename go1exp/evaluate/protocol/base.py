@@ -229,11 +229,7 @@ class Chosen:
 
 
 def chosen(given: Any) -> tuple[list[Chosen], bool]:
-    """Check the group ``protocol`` of a configuration; return its protocols, and whether the grid is among them.
-
-    Raises:
-        ConfigError: with every problem.
-    """
+    """Return the protocols of the group ``protocol``, and whether the grid is one; raise ConfigError of problems."""
     if not isinstance(given, Mapping) or not given:
         raise ConfigError([f"protocol = {given!r}: choose at least one, such as protocol=sinusoid"])
     selected, problems = [], list[str]()

@@ -81,11 +81,7 @@ def play(
     origin: dict[str, Any] | None = None,
     on_step: Progress = lambda done, total: None,
 ) -> Result:
-    """Play a protocol and evaluate its claims; ``origin`` is further information for the report.
-
-    Raises:
-        ConfigError: before anything is played, if it is too long for the memory, or too short.
-    """
+    """Play a protocol, evaluate its claims; ``origin`` is for the report; raise ConfigError of a wrong length first."""
     began, protocol = time.monotonic(), chosen.protocol
     stage = _stage(protocol, agent, rates, on_step)
     refuse(chosen, stage)
@@ -132,12 +128,7 @@ def thresholds(derived: Derived, rows: Sequence[Row]) -> Interval:
 
 
 def refuse(chosen: Chosen, stage: Stage) -> None:
-    """Refuse a protocol that is too long or too short to be played, before anything of its size is made.
-
-    Raises:
-        ConfigError: if no step of the policy is left that counts; names the setting.
-        TooLongError: if it does not fit into memory.
-    """
+    """Refuse what is too long for memory (TooLongError), or leaves no step that counts (ConfigError), by setting."""
     _refuse_too_long(chosen, stage)
     for length in chosen.protocol.lengths():
         dt = length.policy_dt or stage.policy_dt
@@ -149,13 +140,7 @@ def refuse(chosen: Chosen, stage: Stage) -> None:
 
 
 def _refuse_too_long(chosen: Chosen, stage: Stage) -> None:
-    """Refuse a protocol whose robots do not fit into memory, before anything of that size is made.
-
-    What fails for certain is refused, nothing else.
-
-    Raises:
-        TooLongError: names the setting, and the largest value of it that would fit.
-    """
+    """Raise TooLongError, with a setting and what would fit of it, if robots for certain do not fit into memory."""
     available, lengths = memory.free(), chosen.protocol.lengths()
     if available is None or not lengths:
         return

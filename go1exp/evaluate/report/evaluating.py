@@ -79,12 +79,9 @@ def evaluate_run(run: Path, settings: EvaluationSettings, on_step: Progress) -> 
 def evaluate_missing(
     wanted: Sequence[Wanted], settings: EvaluationSettings, on_run: Callable[[int, int, str], Progress]
 ) -> list[str]:
-    """Evaluate runs one after the other and write the results into their folders; return remarks.
+    """Evaluate runs one by one into their folders; return remarks; raise TooLongError if memory is too small.
 
-    ``on_run`` gets the number of the evaluation, the number of all and its label, and returns a progress callback.
-
-    Raises:
-        TooLongError: if the evaluations do not fit into memory.
+    ``on_run`` gets the number of an evaluation, that of all, and its label, and returns a progress callback.
     """
     notes = []
     for number, each in enumerate(wanted, 1):

@@ -139,12 +139,7 @@ def _evaluation(name: str, study: Study) -> Evaluation:
 
 
 def _read(name: str, file: Path) -> RunRows:
-    """Read a file of an evaluation and its rows.
-
-    Raises:
-        ConfigError: if this version does not know its protocol.
-        OSError, ValueError, KeyError, TypeError: if it is damaged.
-    """
+    """Read an evaluation and its rows; raise ConfigError of an unknown protocol, other errors of a damaged file."""
     about = json.loads(file.read_text())
     if not isinstance(about, dict):
         raise TypeError("holds no evaluation")

@@ -117,12 +117,9 @@ def _ends(box: Mailbox) -> dict[str, Any]:
 
 
 def launch(target: Callable[[endpoints.ViewerEndpoint], None], plugins: list[Any]) -> viewer_handle.ViewerHandle:
-    """Run a viewer in a process of its own, as ``mujoco.studio.launch_thread`` does in a thread.
+    """Run a viewer in a fork of this process, as ``mujoco.studio.launch_thread`` does in a thread; return our handle.
 
-    The process is a fork: it has what this one has loaded, and starts at once.
-
-    Returns:
-        The handle of this side; its use raises ``Expected`` when the page ended by an error.
+    Its use raises ``Expected`` when the page ended by an error.
     """
     context = multiprocessing.get_context("fork")
     ours, theirs = context.Pipe()

@@ -245,17 +245,10 @@ class RobotProcess:
     ) -> None:
         """Start it and wait until it listens.
 
-        Args:
-            groups: the configuration of the groups of ``machine.Body``, as plain data that can be pickled.
-            tile: row and column of the tile on which it begins.
-            config: its setup.
-            address: where to listen.
-            seconds: how long it runs, s; None until it is closed.
-            say: prints a line; an importable function, since it is called in the other process.
-
-        Raises:
-            ConfigError: if its settings are refused.
-            Expected: if it cannot listen there, or ends before.
+        ``groups`` are those of ``machine.Body`` as plain data, ``tile`` is the row and column where it begins, and
+        ``seconds`` how long it runs, None until it is closed. ``say`` prints a line in the other process: an importable
+        function. Raise ConfigError if its settings are refused, and Expected if it cannot listen at ``address``, or
+        ends before.
         """
         context = multiprocessing.get_context("spawn")
         self._pipe, other = context.Pipe()

@@ -225,17 +225,9 @@ def run(
 ) -> None:
     """Run a show in the browser until Ctrl-C.
 
-    Args:
-        show: a simulation or a recording.
-        windows: panels, which send ``Ask`` and take ``Shown``.
-        title: of the page.
-        host: interface to listen on.
-        port: to listen on; 0 takes the first free one.
-        pad: the browser's gamepad, which the windows read.
-        on_open: called with the page's address and instructions.
-
-    Raises:
-        Expected: if the port is taken, or the server cannot be guarded.
+    ``windows`` are panels, which send ``Ask`` and take ``Shown``, and may read the gamepad ``pad``. ``host`` is the
+    interface to listen on, at ``port`` or, for 0, the first free one. ``on_open`` gets the page's address and
+    instructions. Raise Expected if the port is taken, or the server cannot be guarded.
     """
     sock = listening(host, port)
     bound = sock.getsockname()[1]

@@ -155,13 +155,9 @@ class Corners(Steady):
 
 
 def step_answer(along: NDArray[Any], step: int, settle: int, dt: float) -> Row:
-    """Return how a step of a command at row ``step`` was answered.
+    """Return how a step of a command at row ``step`` was answered; the steady state begins at row ``settle``.
 
-    Args:
-        along: (T,) velocity along the command, as a share of the command.
-        step: row of the step.
-        settle: first row of the steady state.
-        dt: period, s.
+    ``along`` (T,) is the velocity along the command, as a share of it, every ``dt`` s.
     """
     reached = float(along[settle:].mean())
     stride = max(1, round(0.36 / dt))
