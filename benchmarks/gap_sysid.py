@@ -35,7 +35,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.gap import known
 from go1exp import robot
-from go1exp.gap.data.cutting import noise
+from go1exp.gap.data.cutting import noise_of
 from go1exp.logs.recording import Recording, RecordingError, read_folder
 from go1exp.sim.physics.scene import load_robot
 
@@ -175,7 +175,7 @@ def identify(recordings: Sequence[Recording]) -> dict[str, Any]:
     """Fit the first recordings, test on the rest, and return what ``verdict.json`` holds."""
     if not all(r.meta.kp and r.meta.kd and r.meta.base == "fixed" for r in recordings):
         raise RecordingError("kp, kd and base=fixed are needed")
-    sd = np.concatenate([noise(recordings, "q"), noise(recordings, "qd")])
+    sd = np.concatenate([noise_of([r.joint(name) for r in recordings]) for name in ("q", "qd")])
     cut = int(np.ceil(FIT_SHARE * len(recordings)))
     fit, kept = Fit(recordings[:cut], sd), Fit(recordings[cut:], sd)
     options = {"max_iters": ITERATIONS, "xtol": 0.01, "x_scale": "jac", "output": io.StringIO()}

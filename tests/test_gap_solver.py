@@ -15,7 +15,7 @@ import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
 from go1exp.cli.record import RIG
 from go1exp.config.compose import compose
 from go1exp.gap.comparison import compare
-from go1exp.gap.data.cutting import even_clock, noise
+from go1exp.gap.data.cutting import even_clock, noise_of
 from go1exp.gap.data.windows import held, splits
 from go1exp.gap.replay.replayer import padded
 from go1exp.gap.replay.rows import Probe
@@ -247,8 +247,8 @@ def plain() -> tuple[simulate.Rig, list[Recording]]:
 
 def test_noise_and_clock_are_those_of_the_logger(plain: tuple[simulate.Rig, list[Recording]]) -> None:
     _, recordings = plain
-    np.testing.assert_allclose(noise(recordings, "q"), 2e-4, rtol=0.08)
-    np.testing.assert_allclose(noise(recordings, "qd"), 0.02, rtol=0.08)
+    np.testing.assert_allclose(noise_of([r.joint("q") for r in recordings]), 2e-4, rtol=0.08)
+    np.testing.assert_allclose(noise_of([r.joint("qd") for r in recordings]), 0.02, rtol=0.08)
     assert np.std(np.diff(recordings[0].t)) > 5e-5  # its stamps are late, its samples are not
     even = np.diff(even_clock(recordings[0]))
     np.testing.assert_allclose(even, 0.002, atol=1e-6)

@@ -13,8 +13,8 @@ from typing import Any
 _HOME = {
     "explain": "stages.explain",
     "check": "stages.explain",
-    "apply": "stages",
     "compare": "comparison",
+    "apply": "stages",
     "Comparison": "comparison",
     "NotComparable": "comparison",
     "robot_of": "robots.fixed_base",
@@ -23,17 +23,7 @@ _HOME = {
 }
 """Public name -> module of this package that has it."""
 
-__all__ = [  # noqa: RUF022  (in the order in which a reader needs them)
-    "explain",
-    "check",
-    "compare",
-    "apply",
-    "robot_of",
-    "Comparison",
-    "NotComparable",
-    "GapResult",
-    "GapSettings",
-]
+__all__ = list(_HOME)
 
 
 def __getattr__(name: str) -> Any:

@@ -130,7 +130,8 @@ class Meta:
     @model_validator(mode="after")
     def _consistent(self) -> Meta:
         wrong = []
-        twice = [name for name, n in Counter(_joint_columns(self.joints)).items() if n > 1]
+        columns = Counter(c for quantity in JOINT_QUANTITIES for c in joint_channels(quantity, self.joints))
+        twice = [name for name, n in columns.items() if n > 1]
         if twice:
             wrong.append(f"joints: must be different, and give different columns; {', '.join(twice)} occurs twice")
         for key in ("kp", "kd", "tau_limit"):
@@ -152,10 +153,6 @@ _META = TypeAdapter(Meta)
 def as_json(meta: Meta) -> bytes:
     """Return metadata as JSON. That without a contact is to the byte what it was before there was such a field."""
     return _META.dump_json(meta, exclude={"contact"} if meta.contact is None else None)
-
-
-def _joint_columns(joints: Iterable[str]) -> list[str]:
-    return [column for quantity in JOINT_QUANTITIES for column in joint_channels(quantity, joints)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,7 +312,9 @@ def read(path: Path) -> Recording:
             table = file.read()
     except (pa.ArrowException, OSError) as error:
         why = f"not a whole Parquet file ({str(error).splitlines()[0]})"
-        raise RecordingError(f"{path}: {why}{'' if _begins_as_parquet(path) else IMPORT}") from error
+        with path.open("rb") as opened_again:
+            parquet = opened_again.read(4) == b"PAR1"  # as every Parquet file begins
+        raise RecordingError(f"{path}: {why}{'' if parquet else IMPORT}") from error
     try:
         meta = _META.validate_json(text)
     except ValidationError as error:
@@ -325,11 +324,6 @@ def read(path: Path) -> Recording:
     recording = Recording(meta, {name: np.array(table.column(name).to_numpy()) for name in table.column_names})
     _stop(path, problems(recording))
     return recording
-
-
-def _begins_as_parquet(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(4) == b"PAR1"
 
 
 def _schema_problems(file: pq.ParquetFile) -> list[str]:

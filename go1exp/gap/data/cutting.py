@@ -53,16 +53,12 @@ def even_clock(recording: Recording) -> np.ndarray:
     return t if true_jitter > 0.5 else offset + period * number
 
 
-def noise(recordings: Sequence[Recording], quantity: str) -> np.ndarray:
-    """Return the noise of a quantity (J,), as standard deviation: from third differences where the robot moves least.
-
-    Where values have steps so coarse that a resting joint shows none of its noise, a uniform error of one step counts.
-    """
-    return noise_of([r.joint(quantity) for r in recordings])
-
-
 def noise_of(series: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the noise of several episodes' readings (T, J), in the way of :func:`noise`."""
+    """Return the noise (J,) of several episodes' readings (T, J), as standard deviation.
+
+    It is read from third differences where the robot moves least. Where values have steps so coarse that a resting
+    joint shows none of its noise, a uniform error of one step counts.
+    """
     blocks, steps = [], []
     for values in series:
         third = np.diff(values, 3, axis=0)
@@ -248,7 +244,7 @@ def cut(
         RecordingError: if not one window fits.
     """
     quantities = QUANTITIES if settings.torque and all(r.has("tau_est") for r in recordings) else QUANTITIES[:2]
-    sd = np.stack([noise(recordings, name) for name in quantities])
+    sd = np.stack([noise_of([r.joint(name) for r in recordings]) for name in quantities])
     clocks = [even_clock(r) for r in recordings]
     period = float(np.median([np.median(np.diff(t)) for t in clocks]))
     if settings.window_s < 2.0 * period:

@@ -203,11 +203,6 @@ class _Search:
                 results.append(tuple(worths))
         return results
 
-    def note(self, worths: Sequence[tuple[Worth, ...]]) -> None:
-        """Remember how far any design has come, pair by pair."""
-        for each in worths:
-            self.reach = [max(a, b, key=_order) for a, b in zip(self.reach, each, strict=True)]
-
 
 def _order(worth: Worth) -> tuple[float, float]:
     return worth.power, worth.gain
@@ -259,7 +254,8 @@ def choose(
         near = search.within_limits(neighbours(finalists[top].design, FINALISTS, settings.gains, attitudes, rng))
         if near:
             finalists, worths = [*finalists, *near], [*worths, *search.evaluated(near, MORE)]
-    search.note(worths)
+    for each in worths:
+        search.reach = [max(a, b, key=_order) for a, b in zip(search.reach, each, strict=True)]
     goals = attainable(worths, False)
     if not goals:
         return Choice(None, tuple(search.reach), tuple(search.reach), search.tried, search.beyond)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import cast
+from typing import ClassVar, cast
 
 import numpy as np
 import torch
@@ -23,12 +23,15 @@ from go1exp.sim.env.plant import Plant
 
 
 class ImuRecorder:
-    """Keeps the motion of the trunks of a batch, and returns what their IMUs would measure."""
+    """Keeps the motion of the trunks of a batch, and returns what their IMUs would measure.
 
-    def __init__(self, steps: int, rows: int, site: np.ndarray) -> None:
+    With ``trunk`` it returns also the attitudes and velocities of the trunks.
+    """
+
+    def __init__(self, steps: int, rows: int, site: np.ndarray, trunk: bool) -> None:
         """Make room for ``steps`` steps of ``rows`` robots; the IMUs sit at ``site`` (3,) in the trunk, m."""
         self._quat, self._speed = torch.empty(steps, rows, 4).double(), torch.empty(steps, rows, 6).double()
-        self._site = torch.as_tensor(site)
+        self._site, self._trunk = torch.as_tensor(site), trunk
 
     def record(self, k: int, plant: Plant) -> None:
         """Keep the state before step ``k``."""
@@ -36,7 +39,7 @@ class ImuRecorder:
 
     def readings(self, plant: Plant, dt: float) -> Tensor:
         """Return gyro and accelerometer (K, R, 6) at the instants of the angles: speeds lie half a step off those."""
-        after = torch.cat([self._speed[1:], 2.0 * self._speed[-1:] - self._speed[-2:-1]])
+        after = self._next_speed()
         middle, change = 0.5 * (self._speed + after), (after - self._speed) / dt
         rate, turn = middle[..., 3:], change[..., 3:]
         up = torch.zeros_like(rate)
@@ -51,19 +54,15 @@ class ImuRecorder:
 
     def joined(self, joints: np.ndarray, at: np.ndarray, plant: Plant, dt: float) -> np.ndarray:
         """Put the IMU's readings at times ``at`` (R, n), in steps, beside those of the joints (R, n, 2, J)."""
-        imu = self.readings(plant, dt).numpy()
-        return beside(joints, imu, at)
+        y = beside(joints, self.readings(plant, dt).numpy(), at)
+        if not self._trunk:
+            return y
+        velocity = 0.5 * (self._speed + self._next_speed())[..., :3]  # in the world
+        return beside(y, torch.cat([self._quat, velocity], dim=-1).numpy(), at)
 
-
-class TrunkRecorder(ImuRecorder):
-    """Returns also the attitudes and velocities of the trunks."""
-
-    def joined(self, joints: np.ndarray, at: np.ndarray, plant: Plant, dt: float) -> np.ndarray:
-        """Put attitude w-x-y-z and velocity in the world beside the rest."""
-        speed = self._speed[..., :3]
-        after = torch.cat([speed[1:], 2.0 * speed[-1:] - speed[-2:-1]])
-        trunk = torch.cat([self._quat, 0.5 * (speed + after)], dim=-1).numpy()
-        return beside(super().joined(joints, at, plant, dt), trunk, at)
+    def _next_speed(self) -> Tensor:
+        """Return the speeds (K, R, 6) a step later; the last one by a line through the two before."""
+        return torch.cat([self._speed[1:], 2.0 * self._speed[-1:] - self._speed[-2:-1]])
 
 
 def beside(joints: np.ndarray, series: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -83,6 +82,7 @@ class StandingReplayer(Replayer):
     windows: StandingWindows
     held: Machine = field(kw_only=True)
     suspended: Replayer | None = None
+    tells_trunk: ClassVar[bool] = False  # whether the trunk's motion is returned beside what is scored
 
     def run(self, rows: Rows, dt: float) -> np.ndarray:
         """Return what sensors would measure (R, n, 3, J) at the windows' sample times; 0 where nothing is compared."""
@@ -119,14 +119,13 @@ class StandingReplayer(Replayer):
         return torch.cat([place, attitude, q], dim=1), torch.cat([speed, rate, qd], dim=1)
 
     def _recorder(self, steps: int, rows: int) -> ImuRecorder:
-        return ImuRecorder(steps, rows, self.windows.imu_site)
+        return ImuRecorder(steps, rows, self.windows.imu_site, self.tells_trunk)
 
 
 class TrunkReplayer(StandingReplayer):
     """Replays windows of a standing robot, and returns torques and the trunk's motion beside what is scored."""
 
-    def _recorder(self, steps: int, rows: int) -> TrunkRecorder:
-        return TrunkRecorder(steps, rows, self.windows.imu_site)
+    tells_trunk = True
 
 
 HEAVY = 1.0e6

@@ -39,7 +39,8 @@ def audit(recording: Recording) -> AuditReport:
     A recording that cannot be computed with (no clock, values that are not finite, a clock that runs backward) gets
     only the findings about its format.
     """
-    format_findings = [_as_finding(line) for line in problems(recording)]
+    lines = (line.partition(": ") for line in problems(recording))  # channel: message
+    format_findings = [Finding("format", channel, "bad", None, "", message) for channel, _, message in lines]
     if not _computable(recording):
         return _report(recording, format_findings, ())
     excluded = impossible(recording)
@@ -105,7 +106,7 @@ def _channel_table(log: Log, findings: list[Finding], measured: _Measured) -> tu
         table.append(
             Channel(
                 name,
-                worst(f.verdict for f in findings if _concerns(f, name, log)),
+                worst(f.verdict for f in findings if f.channel in (name, log.quantity.get(name))),
                 log.unit(name),
                 float(values.min()),
                 float(values.max()),
@@ -119,12 +120,6 @@ def _channel_table(log: Log, findings: list[Finding], measured: _Measured) -> tu
     return tuple(table)
 
 
-def _as_finding(line: str) -> Finding:
-    """Turn a line of ``recording.problems`` (``channel: message``) into a finding."""
-    channel, _, message = line.partition(": ")
-    return Finding("format", channel, "bad", None, "", message)
-
-
 def _computable(recording: Recording) -> bool:
     channels = recording.channels
     t = channels.get("t")
@@ -132,11 +127,6 @@ def _computable(recording: Recording) -> bool:
         return False
     plain = all(isinstance(v, np.ndarray) and v.shape == t.shape and v.dtype.kind in "fb" for v in channels.values())
     return plain and all(np.isfinite(v).all() for v in channels.values()) and bool(np.all(np.diff(t) > 0))
-
-
-def _concerns(f: Finding, name: str, log: Log) -> bool:
-    """Whether a finding is about this column: by its name, or by its quantity (``imu_acc``)."""
-    return f.channel == name or f.channel == log.quantity.get(name)
 
 
 def _times(log: Log, flags: np.ndarray) -> tuple[tuple[float, float], ...]:

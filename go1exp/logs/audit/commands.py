@@ -136,10 +136,7 @@ def _lagged_correlation(log: Log, target: np.ndarray, q: np.ndarray) -> np.ndarr
     best = np.zeros((target.shape[1], q.shape[1]))
     live = np.outer(np.ptp(target, axis=0) > limits.STILL_ANGLE, np.ptp(q, axis=0) > limits.STILL_ANGLE)
     for lag in range(0, log.samples(LONGEST_LAG) + 1, log.samples(0.01)):
-        a, b = target[: len(target) - lag], q[lag:]
-        a, b = a - a.mean(axis=0), b - b.mean(axis=0)
-        spread = np.outer(np.linalg.norm(a, axis=0), np.linalg.norm(b, axis=0))
-        match = np.where(live, a.T @ b / np.maximum(spread, 1e-12), 0.0)
+        match = np.where(live, signals.correlations(target[: len(target) - lag], q[lag:]), 0.0)
         best = np.where(np.abs(match) > np.abs(best), match, best)
     return best
 
@@ -155,21 +152,16 @@ def timing(log: Log) -> tuple[list[Finding], dict[str, Delay]]:
     known = {j: d for j, d in zip(log.joints, estimates, strict=True) if d is not None}
     findings = []
     middle = float(np.median([d.time for d in known.values()])) if known else 0.0
-    threshold = limits.DELAY + log.dt
-    # An error of two standard deviations is allowed before a delay is reported.
-    late = {j: d for j, d in known.items() if abs(d.time) - 2 * d.error > threshold}
     for joint, d in known.items():
-        name = joint_channel("q", joint)
-        shown = f"answers {log.command} after {d.time * 1e3:.1f} ± {d.error * 1e3:.1f} ms"
-        apart = abs(d.time - middle) - 2 * d.error > limits.DELAY_SPREAD and len(known) > 2
-        if joint in late and d.time > 0:
-            findings.append(finding("delay", name, "suspect", d.time * 1e3, "ms", f"{shown}: delay or clock offset"))
-        elif joint in late:
-            message = f"{shown}, before it is given: a clock offset, or a delayed log of the command"
-            findings.append(finding("delay", name, "suspect", d.time * 1e3, "ms", message))
-        elif apart:
-            message = f"{shown}, the other joints after {middle * 1e3:.1f} ms: delay or clock offset of this one"
-            findings.append(finding("delay", name, "suspect", d.time * 1e3, "ms", message))
+        why = ""  # an error of two standard deviations is allowed before a delay is reported
+        if abs(d.time) - 2 * d.error > limits.DELAY + log.dt:
+            before = ", before it is given: a clock offset, or a delayed log of the command"
+            why = ": delay or clock offset" if d.time > 0 else before
+        elif abs(d.time - middle) - 2 * d.error > limits.DELAY_SPREAD and len(known) > 2:
+            why = f", the other joints after {middle * 1e3:.1f} ms: delay or clock offset of this one"
+        if why:
+            shown = f"answers {log.command} after {d.time * 1e3:.1f} ± {d.error * 1e3:.1f} ms{why}"
+            findings.append(finding("delay", joint_channel("q", joint), "suspect", d.time * 1e3, "ms", shown))
     if known and not findings:
         low, high = (f(d.time for d in known.values()) * 1e3 for f in (min, max))
         message = f"{len(known)} of {len(log.joints)} joints answer after {low:.1f} to {high:.1f} ms"

@@ -53,7 +53,7 @@ def speed(log: Log) -> Iterator[Finding]:
     change = q[last] - q[first]
     lags = np.arange(-most, most + 1)
     whole = signals.antiderivative(log.t, qd)  # (T, J): its differences are changes of angle at any lag
-    match = np.stack([_correlations(change, whole[last + lag] - whole[first + lag]) for lag in lags])
+    match = np.stack([signals.correlations(change, whole[last + lag] - whole[first + lag]) for lag in lags])
     # (lags, J, J); a small cost on the lag decides between equal correlations
     best = np.argmax(np.abs(match) - 1e-4 * np.abs(lags)[:, None, None] / most, axis=0)
     peak = np.take_along_axis(match, best[None], axis=0)[0]
@@ -94,13 +94,6 @@ def _vertex(match: np.ndarray, k: int) -> float:
         return 0.0
     a, b, c = match[k - 1 : k + 2]
     return float(0.5 * (a - c) / (a - 2.0 * b + c)) if a - 2.0 * b + c < 0.0 else 0.0
-
-
-def _correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the correlation (J, J) of each column of ``a`` (N, J) with each of ``b``; 0 where one is constant."""
-    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
-    spread = np.outer(np.linalg.norm(a, axis=0), np.linalg.norm(b, axis=0))
-    return np.divide(a.T @ b, spread, out=np.zeros_like(spread), where=spread > 0)
 
 
 def torque(log: Log) -> Iterator[Finding]:
@@ -165,7 +158,7 @@ def rotation(log: Log) -> Iterator[Finding]:
         change = (turn[first].inv() * turn[last]).as_rotvec()
         whole = signals.antiderivative(log.t, log.recording.block(*names))
         integral = whole[last] - whole[first]
-        match = _correlations(change, integral)
+        match = signals.correlations(change, integral)
         # Turning is twice the vector part of a quaternion; noise of what is compared with makes a scale look too small.
         blur = 2.0 * np.sqrt(2.0) * max(log.noise(channel) for channel in VECTORS[attitude])
         moves = (np.std(change, axis=0) > max(limits.MOTION * blur, 1e-3)) & (np.std(integral, axis=0) > 0)

@@ -162,6 +162,13 @@ def correlation(a: np.ndarray, b: np.ndarray) -> float:
     return float(a @ b / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12))
 
 
+def correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the correlation (J, K) of each column of ``a`` (N, J) with each of ``b`` (N, K); 0 if one is constant."""
+    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
+    spread = np.outer(np.linalg.norm(a, axis=0), np.linalg.norm(b, axis=0))
+    return np.divide(a.T @ b, spread, out=np.zeros_like(spread), where=spread > 0)
+
+
 def antiderivative(t: np.ndarray, rate: np.ndarray) -> np.ndarray:
     """Integrate a cubic spline through ``rate`` (T, ...) from the first sample to each."""
     return CubicSpline(t, rate, axis=0).antiderivative()(t)

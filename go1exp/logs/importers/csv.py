@@ -12,11 +12,10 @@ import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
-import go1exp.logs.importers.clock as clocks
 from go1exp.base.wording import counted
 from go1exp.config.schema.joint_values import JointValues, each_within, spread
 from go1exp.config.schema.registry import STRICT, ConfigError, Positive, as_json, explain, importer, nearest
-from go1exp.logs.importers.source import LEVEL, files, recording, without_repeats
+from go1exp.logs.importers.source import LEVEL, check_clock, episodes, files, overflow, recording, without_repeats
 from go1exp.logs.importers.table import UTF8, Layout, Table, names, read
 from go1exp.logs.recording import FLAG, FOOT_FORCE, JOINT_QUANTITIES, VECTORS, Quaternion, Recording, RecordingError
 
@@ -204,11 +203,9 @@ def _recordings(
         # Stamps may be seconds since 1970, of which float64 holds no more than parts of a microsecond.
         cells = table.columns[clock.column]
         channels["t"] = _channel(path, "t", cells - cells[0], clock) - clock.offset
-    overflows = clock is not None and clocks.overflow(cells)
+    overflows = clock is not None and overflow(cells)
     times = channels["t"] if clock is not None and not overflows else None
-    parts = clocks.episodes(
-        None if episode is None else table.columns[episode], times, len(next(iter(channels.values())))
-    )
+    parts = episodes(None if episode is None else table.columns[episode], times, len(next(iter(channels.values()))))
     for name, rows in parts:
         remarks = list(general)
         where = f"{path}: episode {name}" if name else str(path)
@@ -218,7 +215,7 @@ def _recordings(
                 if left := len(rows) - len(kept):
                     remarks.append(f"{counted(left, 'row')} with the time of the row before: left out.")
                 rows = kept
-            clocks.check(where, channels["t"][rows], cells[rows], clock.column, partial(_place, table, rows))
+            check_clock(where, channels["t"][rows], cells[rows], clock.column, partial(_place, table, rows))
             remarks.append(f"t = 0 is {cells[rows[0]]} in the column {clock.column!r}.")
             series = {key: values[rows] for key, values in channels.items()}
             series["t"] = series["t"] - series["t"][0]
