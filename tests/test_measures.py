@@ -10,7 +10,6 @@ import pytest
 
 from go1exp import robot
 from go1exp.config.schema.registry import members
-from go1exp.evaluate.statistics.intervals import mean_interval, phase_interval, share_interval
 from go1exp.extend.testing.traces import random_trace, without
 from go1exp.mdp.measures import every_measure, measured
 from go1exp.mdp.measures.trace import NotMeasured, Trace, find_runs, largest_within, settled
@@ -338,30 +337,3 @@ def test_the_largest_value_of_a_stretch_may_be_its_last_and_the_record_s_last() 
     values = np.array([[1.0, 5.0, 2.0], [7.0, 0.0, 9.0]])
     column, start, stop = np.array([0, 1, 0]), np.array([0, 1, 2]), np.array([2, 3, 3])
     assert largest_within(values, column, start, stop).tolist() == [5.0, 9.0, 2.0]
-
-
-# ---------------------------------------------------------------------- intervals
-
-
-def test_the_mean_has_student_s_interval() -> None:
-    interval = mean_interval([1.0, 2.0, 3.0, np.nan])
-    assert (interval.estimate, interval.n) == (2.0, 3)
-    assert interval.high - 2.0 == pytest.approx(4.302653 / np.sqrt(3), rel=1e-5)  # t(0.975, 2 degrees of freedom)
-    assert np.isnan(mean_interval([4.0]).low)
-    assert mean_interval([np.nan]).n == 0
-
-
-def test_the_share_has_wilson_s_interval() -> None:
-    none = share_interval(0, 600)
-    assert none.low == 0.0
-    assert none.high == pytest.approx(1.959964**2 / (600 + 1.959964**2), rel=1e-5)
-    assert share_interval(13, 500).low == pytest.approx(0.01526, abs=1e-4)
-    assert share_interval(0, 0).n == 0
-
-
-def test_phases_on_both_sides_of_zero_have_their_mean_at_zero() -> None:
-    interval = phase_interval([0.98, 0.02, 0.99, 0.01, np.nan])
-    assert min(interval.estimate, 1.0 - interval.estimate) == pytest.approx(0.0, abs=1e-9)
-    assert interval.n == 4
-    assert interval.high - interval.low == pytest.approx(2 * mean_interval([-0.02, 0.02, -0.01, 0.01]).high)
-    assert np.isnan(phase_interval([]).estimate)

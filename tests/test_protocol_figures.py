@@ -1,21 +1,26 @@
-"""Parts of protocols: figures of motions made by hand, lanes of rising difficulty, commands over time, kicks."""
+"""Parts of protocols: figures by hand, lanes of rising difficulty, commands over time, kicks, verdicts on claims."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 
 from go1exp import robot
 from go1exp.config.compose import compose
 from go1exp.evaluate.protocol.base import chosen
+from go1exp.evaluate.protocol.claims import Claim, evaluated, verdict
 from go1exp.evaluate.protocol.ground import COURSE, RESOLUTION, RUN_UP, SHAPES, TREAD, UNITS, Lanes, goal
 from go1exp.evaluate.protocol.kinds import energy, gait, push_map, rate, terrain
 from go1exp.evaluate.protocol.plan import Constant, Impulses, Kicker, Motion, Sine, Steps, heading, phasors, response
 from go1exp.evaluate.protocol.stage import delay_of_effects
+from go1exp.evaluate.quantities import FELL, FINGERPRINT, MOVING, Column, distinct, summary
+from go1exp.evaluate.statistics.intervals import Interval
 from go1exp.mdp.measures.trace import Trace
 from go1exp.sim.task import parse_train
 from go1exp.sim.terrain import build_terrain
@@ -301,3 +306,69 @@ def test_forces_of_others_are_kept_and_added_to() -> None:
     kicked(backend, impulses, 0.2)
     assert backend.applied()[:, 2].tolist() == [1.0, 1.0]
     np.testing.assert_allclose(12.5 * backend.qvel[:, :3].numpy(), [[3.0, 0.0, 0.2]] * 2, atol=1e-9)
+
+
+# ---------------------------------------------------------------------- claims
+
+MOST = Claim(quantity="error", at_most=1.0, tolerance=0.2, source="here")
+LEAST = Claim(quantity="error", at_least=1.0, tolerance=0.2, source="here")
+BETWEEN = Claim(quantity="error", at_least=0.9, at_most=1.1, tolerance=0.05, source="here")
+
+
+@pytest.mark.parametrize(
+    ("claim", "estimate", "low", "high", "said"),
+    [
+        (MOST, 0.9, 0.8, 1.0, "met"),
+        (MOST, 0.9, 0.8, 1.01, "close"),
+        (MOST, 1.0, 0.8, 1.2, "close"),
+        (MOST, 1.0, 0.8, 1.21, "inconclusive"),
+        (MOST, 1.2, 1.01, 1.5, "close"),
+        (MOST, 1.21, 1.01, 1.5, "not met"),
+        (MOST, 0.9, math.nan, math.nan, "inconclusive"),
+        (MOST, math.nan, math.nan, math.nan, "inconclusive"),
+        (LEAST, 1.1, 1.0, 1.2, "met"),
+        (LEAST, 1.0, 0.8, 1.2, "close"),
+        (LEAST, 1.0, 0.79, 1.2, "inconclusive"),
+        (LEAST, 0.79, 0.6, 0.99, "not met"),
+        (BETWEEN, 1.0, 0.9, 1.1, "met"),
+        (BETWEEN, 1.0, 0.86, 1.14, "close"),
+        (BETWEEN, 1.0, 0.8, 1.2, "inconclusive"),
+        (BETWEEN, 1.3, 1.2, 1.4, "not met"),
+        (BETWEEN, 0.7, 0.6, 0.8, "not met"),
+    ],
+)
+def test_verdicts_at_their_borders(claim: Claim, estimate: float, low: float, high: float, said: str) -> None:
+    assert verdict(Interval(estimate, low, high, 10), claim) == said
+
+
+def test_a_claim_is_judged_by_its_worst_condition() -> None:
+    rows = [{"speed": s, "error": e, "robot": n} for s, e in ((1.0, 0.5), (2.0, 3.0)) for n in range(5)]
+    for n, row in enumerate(rows):
+        row["error"] += 0.01 * (n % 5)
+    entries = summary(rows, ("speed",), (Column("error", "m", "an error"),))
+    everywhere = evaluated({"small": MOST}, entries)[0]
+    assert (everywhere.word, everywhere.condition, everywhere.conditions) == ("not met", {"speed": 2.0}, 2)
+    where = Claim(quantity="error", at_most=1.0, tolerance=0.2, source="here", where={"speed": 1.0})
+    assert evaluated({"small": where}, entries)[0].word == "met"
+    nowhere = Claim(quantity="error", at_most=1.0, tolerance=0.2, source="here", where={"speed": 7.0})
+    assert evaluated({"small": nowhere}, entries)[0].word == "inconclusive"
+
+
+@pytest.mark.parametrize("counted", [20, 10])
+def test_falls_are_counted_per_moving_minute_of_robots_that_were_up_before(counted: int) -> None:
+    """A robot that was down before has no fall of its own, and is not in the share."""
+    rows = [
+        {"a": 1, "robot": n, "fell": n < 3 if n < counted else None, "moving_s": 30.0 * (n < counted)}
+        for n in range(20)
+    ]
+    figures = summary(rows, ("a",), (FELL, MOVING))[0]["figures"]
+    assert (figures["fell"]["n"], figures["fell"]["estimate"]) == (counted, pytest.approx(3 / counted))
+    assert figures["falls_per_minute"]["estimate"] == pytest.approx(3 / (0.5 * counted))
+    known = stats.binomtest(3, counted).proportion_ci(method="wilson")
+    assert figures["fell"]["low"] == pytest.approx(known.low, rel=1e-5)
+
+
+def test_only_robots_that_did_the_same_are_repeats() -> None:
+    rows = [{"a": a, "robot": n, FINGERPRINT: mark} for a in (1, 2) for n, mark in enumerate((0.5, 0.7, 0.5))]
+    assert [(r["a"], r["robot"]) for r in distinct(rows, ("a",), True)] == [(1, 0), (1, 1), (2, 0), (2, 1)]
+    assert [(r["a"], r["robot"]) for r in distinct(rows, ("a",), False)] == [(1, 0), (2, 0)]

@@ -7,20 +7,26 @@ import json
 import math
 import re
 from collections.abc import Callable
-from html.parser import HTMLParser
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
+import yaml
 from torch import Tensor
 
 import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
+from go1exp.base.paths import data_root
+from go1exp.cli.evaluate import refuse
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError, members
 from go1exp.evaluate.agents import Agent, ControllerAgent, PolicyAgent
+from go1exp.evaluate.controller.mpc import Mpc
+from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
 from go1exp.evaluate.protocol import comparing
 from go1exp.evaluate.protocol.base import Chosen, chosen
 from go1exp.evaluate.protocol.kinds.push_map import largest_survived
@@ -64,10 +70,6 @@ def agent(make_task: Callable[..., TaskConfig]) -> PolicyAgent:
 
 
 def small(name: str, *more: str) -> Chosen:
-    container = compose("eval", [f"protocol={name}"])["protocol"]
-    given = {name: dict(container[name])}
-    if name == "terrain":
-        given[name].pop("grounds")
     overrides = [f"++protocol.{name}.{o}" for o in (*SMALL[name], *more)]
     if name == "terrain":
         overrides.insert(0, "~protocol.terrain.grounds")
@@ -77,15 +79,9 @@ def small(name: str, *more: str) -> Chosen:
 
 
 @pytest.fixture(scope="module")
-def results(agent: PolicyAgent) -> dict[str, Result]:
+def result(agent: PolicyAgent) -> Callable[[str], Result]:
     """What came of each protocol, played once."""
-    return {}
-
-
-def result(name: str, agent: PolicyAgent, results: dict[str, Result]) -> Result:
-    if name not in results:
-        results[name] = play(small(name), agent, Rates(seed=1))
-    return results[name]
+    return cache(lambda name: play(small(name), agent, Rates(seed=1)))
 
 
 EVERY = list(members("protocol"))
@@ -99,38 +95,21 @@ def test_every_protocol_has_a_file_and_a_small_size() -> None:
         assert one.protocol.claims
 
 
-class Tags(HTMLParser):
-    """Notes which elements are open."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.wrong: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: Any) -> None:
-        if tag not in ("meta", "br"):
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: Any) -> None:
-        pass
-
-    def handle_endtag(self, tag: str) -> None:
-        if not self.open or self.open.pop() != tag:
-            self.wrong.append(tag)
-
-
 def unclosed(page: str) -> list[str]:
     """Elements of a page that are not closed in order."""
-    tags = Tags()
-    tags.feed(page)
-    return tags.wrong + tags.open
+    wrong: list[str] = []
+    still_open: list[str] = []
+    for closing, tag, alone in re.findall(r"<(/?)([a-z][\w:]*)(?:[^>\"]|\"[^\"]*\")*?(/?)>", page):
+        if closing and (not still_open or still_open.pop() != tag):
+            wrong.append(tag)
+        elif not (closing or alone or tag in ("meta", "br")):
+            still_open.append(tag)
+    return wrong + still_open
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_a_protocol_makes_rows_json_and_a_page(
-    name: str, agent: PolicyAgent, results: dict[str, Result], tmp_path: Path
-) -> None:
-    one = result(name, agent, results)
+def test_a_protocol_makes_rows_json_and_a_page(name: str, result: Callable[[str], Result], tmp_path: Path) -> None:
+    one = result(name)
     rows_file, json_file, page_file = write(one, tmp_path)
     rows = pq.read_table(rows_file).to_pylist()
     keys, columns = one.chosen.protocol.keys, {c.name for c in one.chosen.protocol.columns()}
@@ -156,8 +135,8 @@ def test_a_protocol_makes_rows_json_and_a_page(
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_a_subject_is_not_told_apart_from_itself(name: str, agent: PolicyAgent, results: dict[str, Result]) -> None:
-    one = result(name, agent, results)
+def test_a_subject_is_not_told_apart_from_itself(name: str, result: Callable[[str], Result]) -> None:
+    one = result(name)
     again = dataclasses.replace(one, label="again")
     differences = comparing.compared(one, again)
     assert {d.word for d in differences} == {"no significant difference"}
@@ -183,11 +162,9 @@ def test_robots_of_the_nominal_protocol_count_once(agent: PolicyAgent) -> None:
     assert (len(random.played.rows), random.repeats) == (3, 0)
 
 
-def test_a_better_subject_is_called_better_and_a_worse_one_worse(
-    agent: PolicyAgent, results: dict[str, Result]
-) -> None:
+def test_a_better_subject_is_called_better_and_a_worse_one_worse(result: Callable[[str], Result]) -> None:
     """Rows whose difference is known: every error is 0.1 less, hardly more for some, one of which robots is missing."""
-    one = result("gait", agent, results)
+    one = result("gait")
     rows = [
         {**row, "rmse_x": row["rmse_x"] - 0.1 - 1e-4 * row[ROBOT], "fell": True}
         for row in one.played.rows
@@ -262,8 +239,6 @@ def test_a_kick_moves_a_robot_by_its_momentum(agent: PolicyAgent) -> None:
     session.core.backend.qpos[:, 2] += 1.0
     session.run(1)
     model = session.core.backend.model
-    import mujoco
-
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = session.core.backend.qpos[0].numpy(), session.core.backend.qvel[0].numpy()
     mujoco.mj_forward(model, data)
@@ -368,8 +343,6 @@ def test_a_wrong_protocol_is_refused_in_words(overrides: str, said: str) -> None
 def test_a_policy_that_does_not_see_the_velocity_is_refused(agent: PolicyAgent) -> None:
     without = tuple(t for t in agent.task.observation if t.entry.name != "base_linear_velocity")
     blind = PolicyAgent("blind", dataclasses.replace(agent.task, observation=without), agent.policy)
-    from go1exp.cli.evaluate import refuse
-
     with pytest.raises(ConfigError, match=r"protocol.rate.velocities = 'estimated': the policy of blind"):
         refuse([small("rate")], blind)
     refuse([small("kicks")], blind)
@@ -387,12 +360,6 @@ def test_paper_is_all_of_the_papers() -> None:
 def test_the_mpc_is_put_back_to_an_instant(make_task: Callable[..., TaskConfig]) -> None:
     """It walks on as it did, bit for bit: a push map need not be walked again for every kick."""
     pytest.importorskip("daqp")
-    import yaml
-
-    from go1exp.base.paths import data_root
-    from go1exp.evaluate.controller.mpc import Mpc
-    from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
-
     file = data_root() / "conf/controller/mpc.yaml"
     settings = parse_controller(yaml.safe_load(file.read_text()) | {"stand": 0.0})
     assert isinstance(settings, MpcSettings)

@@ -1,4 +1,4 @@
-"""Statistics over training runs against closed forms, a published example, and simulated studies with known truth."""
+"""Statistics over robots and training runs against closed forms, a published example, and studies of known truth."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import stats
 
 import go1exp.evaluate.statistics.runs as compare
 from go1exp.base.paths import data_root
@@ -15,7 +16,13 @@ from go1exp.evaluate.statistics import association
 from go1exp.evaluate.statistics.intervals import (
     Interval,
     bootstrap_interval,
+    logistic_fit,
     mean_interval,
+    paired_mean_interval,
+    paired_share_interval,
+    pairs_needed,
+    phase_interval,
+    rate_interval,
     share_interval,
     stratified_mean_interval,
 )
@@ -26,6 +33,7 @@ from go1exp.evaluate.statistics.runs import (
     iqm_interval,
     pooled_share,
     share_bootstrap,
+    verdict_by_interval,
 )
 
 Floats = NDArray[np.float64]
@@ -41,8 +49,6 @@ def test_the_interquartile_mean_is_the_mean_of_the_middle_half() -> None:
 
 
 def test_with_three_runs_the_interval_is_students() -> None:
-    from scipy import stats
-
     values = np.array([1.0, 2.0, 4.0])
     half = stats.t.ppf(0.975, 2) * values.std(ddof=1) / math.sqrt(3)
     got = iqm_interval(values)
@@ -127,8 +133,6 @@ def test_the_examples_of_rliable_give_its_numbers() -> None:
 
 def test_runs_that_fall_alike_have_students_wilson_interval() -> None:
     """Without more spread than chance gives, only the quantile differs from Wilson's: none fell in the closed form."""
-    from scipy import stats
-
     got = clustered_share([0, 0, 0], [40, 40, 40])
     z2 = stats.t.ppf(0.975, 2) ** 2
     assert (got.estimate, got.low, got.n) == (0.0, 0.0, 3)
@@ -147,6 +151,130 @@ def test_the_bootstrap_over_runs_draws_whole_runs() -> None:
     assert (got.estimate, got.low, got.high) == (0.5, 0.0, 1.0)
     assert math.isnan(share_bootstrap([3], [40]).low)
     assert math.isnan(clustered_share([3], [40]).low)
+
+
+# ---------------------------------------------------------------------- robots
+
+
+def test_the_mean_has_student_s_interval() -> None:
+    interval = mean_interval([1.0, 2.0, 3.0, math.nan])
+    assert (interval.estimate, interval.n) == (2.0, 3)
+    assert interval.high - 2.0 == pytest.approx(4.302653 / np.sqrt(3), rel=1e-5)  # t(0.975, 2 degrees of freedom)
+    assert math.isnan(mean_interval([4.0]).low)
+    assert mean_interval([math.nan]).n == 0
+
+
+def test_the_share_has_wilson_s_interval() -> None:
+    none = share_interval(0, 600)
+    assert none.low == 0.0
+    assert none.high == pytest.approx(1.959964**2 / (600 + 1.959964**2), rel=1e-5)
+    assert share_interval(13, 500).low == pytest.approx(0.01526, abs=1e-4)
+    assert share_interval(0, 0).n == 0
+
+
+def test_phases_on_both_sides_of_zero_have_their_mean_at_zero() -> None:
+    interval = phase_interval([0.98, 0.02, 0.99, 0.01, math.nan])
+    assert min(interval.estimate, 1.0 - interval.estimate) == pytest.approx(0.0, abs=1e-9)
+    assert interval.n == 4
+    assert interval.high - interval.low == pytest.approx(2 * mean_interval([-0.02, 0.02, -0.01, 0.01]).high)
+    assert math.isnan(phase_interval([]).estimate)
+
+
+def test_rates_have_the_exact_poisson_interval() -> None:
+    interval = rate_interval(3, 10.0)
+    assert stats.poisson.cdf(3, 10.0 * interval.high) == pytest.approx(0.025)
+    assert stats.poisson.sf(2, 10.0 * interval.low) == pytest.approx(0.025)
+    none = rate_interval(0, 10.0)
+    assert (none.low, none.high) == (0.0, pytest.approx(-math.log(0.025) / 10.0))
+    assert math.isnan(rate_interval(0, 0.0).estimate)
+
+
+@pytest.mark.parametrize(("middle", "slope"), [(15.0, 0.5), (0.08, 80.0)])
+def test_a_known_threshold_is_found(middle: float, slope: float) -> None:
+    rng = np.random.default_rng(0)
+    x = np.repeat(np.linspace(0.2, 2.0, 9) * middle, 400)
+    success = rng.uniform(size=len(x)) < 1.0 / (1.0 + np.exp(slope * (x - middle)))
+    fit = logistic_fit(x, success)
+    assert fit is not None
+    assert fit.middle == pytest.approx(middle, rel=0.03)
+    assert fit.slope == pytest.approx(slope, rel=0.15)
+    assert float(fit(fit.where(0.95))) == pytest.approx(0.95)
+    assert fit.where(0.95) < fit.middle
+
+
+def test_a_threshold_between_two_levels_is_between_them_and_none_is_none() -> None:
+    x = np.repeat([1.0, 2.0, 3.0, 4.0], 10)
+    fit = logistic_fit(x, x < 2.5)
+    assert fit is not None
+    assert 2.0 < fit.middle < 3.0
+    assert logistic_fit(x, x > 0) is None
+    assert logistic_fit(x, x < 0) is None
+
+
+def test_the_bootstrap_agrees_with_students_interval() -> None:
+    each = np.random.default_rng(1).normal(size=200)
+    found = bootstrap_interval(lambda robots: float(each[robots].mean()), 200, draws=2000)
+    known = stats.t.interval(0.95, 199, each.mean(), stats.sem(each))
+    np.testing.assert_allclose((found.low, found.high), known, atol=0.02)
+    assert math.isnan(bootstrap_interval(lambda r: 1.0, 1).low)
+
+
+@pytest.mark.parametrize("n", [3, 4, 8, 40])
+def test_of_equal_pairs_one_in_twenty_is_told_apart_by_chance(n: int) -> None:
+    rng = np.random.default_rng(n)
+    words = [verdict_by_interval(paired_mean_interval(rng.normal(size=n)), "lower") for _ in range(2000)]
+    significant = sum(w != "no significant difference" for w in words)
+    assert stats.binomtest(significant, 2000, 0.05).pvalue > 0.001
+
+
+def test_two_pairs_are_too_few_for_a_verdict() -> None:
+    assert verdict_by_interval(paired_mean_interval(np.array([1.0, 1.01])), "lower") == "no significant difference"
+    assert verdict_by_interval(paired_mean_interval(np.array([1.0, 1.01, 1.02])), "lower") == "worse"
+
+
+def test_pairs_that_all_differ_alike_tell_nothing_and_equal_pairs_are_equal() -> None:
+    same = paired_mean_interval([0.41 - 0.35, 0.43 - 0.37])  # kicks are timed by the policy's period
+    assert same.estimate == pytest.approx(0.06)
+    assert verdict_by_interval(same, "lower") == "no significant difference"
+    assert pairs_needed([0.41 - 0.35, 0.43 - 0.37]) is None
+    none = paired_mean_interval([0.0, 0.0, 0.0])
+    assert (none.estimate, none.low, none.high) == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("n", [10, 40, 400])
+def test_shares_of_pairs_cover_the_truth(n: int) -> None:
+    """Agresti and Min's interval holds the true difference in about 95 of 100 samples."""
+    rng = np.random.default_rng(n)
+    inside = 0
+    for _ in range(400):
+        base = rng.uniform(size=n)
+        interval = paired_share_interval(base < 0.3, (base < 0.2) | (rng.uniform(size=n) < 0.3))
+        inside += interval.low <= 0.2 + 0.8 * 0.3 - 0.3 <= interval.high
+    assert 0.92 <= inside / 400 <= 0.995
+    same = paired_share_interval(np.ones(n, bool), np.ones(n, bool))
+    assert same.estimate == 0.0
+    assert same.low < 0.0 < same.high
+
+
+def test_the_pairs_that_would_tell_do_tell() -> None:
+    rng = np.random.default_rng(3)
+    seen = rng.normal(0.2, 1.0, 2000)
+    needed = pairs_needed(seen)
+    assert needed is not None
+    known = (1.96 + 0.8416) ** 2 * (seen.std(ddof=1) / seen.mean()) ** 2
+    assert needed == pytest.approx(known, rel=0.01)
+    told = [stats.ttest_1samp(rng.normal(seen.mean(), seen.std(), needed), 0.0).pvalue < 0.05 for _ in range(300)]
+    assert 0.72 <= np.mean(told) <= 0.88
+    assert pairs_needed(np.zeros(10)) is None
+
+
+def test_words_of_differences() -> None:
+    assert verdict_by_interval(Interval(0.2, 0.1, 0.3, 9), "higher") == "better"
+    assert verdict_by_interval(Interval(0.2, 0.1, 0.3, 9), "lower") == "worse"
+    assert verdict_by_interval(Interval(-0.2, -0.3, -0.1, 9), "lower") == "better"
+    assert verdict_by_interval(Interval(0.0, -0.1, 0.1, 9), "lower") == "no significant difference"
+    assert verdict_by_interval(Interval(0.1, math.nan, math.nan, 1), "lower") == "no significant difference"
+    assert verdict_by_interval(Interval(0.0, 0.0, 0.0, 9), "lower") == "no significant difference"
 
 
 # ---------------------------------------------------------------------- two groups
@@ -298,8 +426,6 @@ def test_intervals_of_falls_hold_the_truth_where_runs_differ() -> None:
 
 
 def test_the_test_of_two_groups_is_wilcoxons() -> None:
-    from scipy import stats
-
     rng = np.random.default_rng(4)
     for n, m in ((4, 4), (5, 7), (8, 8)):
         a, b = rng.normal(size=n), rng.normal(size=m) + 0.7
