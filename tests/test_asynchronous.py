@@ -28,6 +28,11 @@ from tests.small_run import SMALL, train
 BRIEF = ("eval.x=[0.5]", "eval.y=[]", "eval.yaw=[]", "eval.episodes=2", "eval.duration_s=0.4", "eval.settle_s=0.2")
 
 
+def evaluating(run: Path, iteration: int = 0, *more: str) -> AsyncEvaluation:
+    """The evaluation beside a training that begins, or goes on after an iteration."""
+    return AsyncEvaluation(parse_train(compose("train", [*SMALL, "eval.every=1", *more])), run, iteration)
+
+
 def rows(file: Path) -> list[dict[str, float]]:
     return [{k: float(v) for k, v in r.items()} for r in csv.DictReader(file.read_text().splitlines())]
 
@@ -44,19 +49,6 @@ def test_a_job_gives_the_figures_of_its_policy(tmp_path: Path) -> None:
     assert 0.0 < result["figures"]["error_xy"] <= result["figures"]["score"] < 2.0
     lost = answered(tmp_path, {**job, "policy": "none.pt", "settings": settings})
     assert lost["problem"].startswith("evaluate during the training failed: FileNotFoundError")
-
-
-def test_the_best_policy_is_that_of_the_lowest_score(tmp_path: Path) -> None:
-    evaluation = AsyncEvaluation(parse_train(compose("train", [*SMALL, "eval.every=1"])), tmp_path, 0)
-    for iteration, value in ((1, 0.5), (2, 0.3), (3, 0.4)):
-        file = tmp_path / f"{iteration}.pt"
-        file.write_bytes(bytes([iteration]))
-        result = {"kind": "evaluate", "iteration": iteration, "steps": 16 * iteration, "policy": str(file)}
-        figures = evaluation._take({**result, "figures": {"score": value, "fall_share": 0.0}})
-        assert figures == {"eval/iteration": iteration, "eval/score": value, "eval/fall_share": 0.0}
-    assert (tmp_path / "best.pt").read_bytes() == bytes([2])
-    assert json.loads((tmp_path / "best.json").read_text())["iteration"] == 2
-    assert [r["score"] for r in rows(tmp_path / "evals.csv")] == [0.5, 0.3, 0.4]
 
 
 @pytest.mark.slow("go1exp/evaluate/", "go1exp/train/")
@@ -78,23 +70,26 @@ def test_policies_are_evaluated_and_the_best_is_kept(tmp_path: Path) -> None:
 
 
 def test_a_run_that_goes_on_drops_evaluations_of_later_iterations(tmp_path: Path) -> None:
-    config = parse_train(compose("train", [*SMALL, "eval.every=1"]))
     head = "iteration,steps,score,error_xy,error_yaw,fall_share\n"
     (tmp_path / "evals.csv").write_text(f"{head}1,16,0.5,0.5,0.5,0.0\n2,32,0.4,0.4,0.5,0.0\n3,48,0.3")
-    AsyncEvaluation(config, tmp_path, 1)
+    evaluating(tmp_path, 1)
     assert [r["iteration"] for r in rows(tmp_path / "evals.csv")] == [1]
 
 
-def evaluated_run(run: Path, scores: dict[int, float]) -> AsyncEvaluation:
-    """A run in which policies had these scores by iteration; a policy is a byte with its iteration."""
-    evaluation = AsyncEvaluation(parse_train(compose("train", [*SMALL, "eval.every=1"])), run, 0)
+def take(evaluation: AsyncEvaluation, iteration: int, score: float, file: Path) -> dict[str, Any]:
+    """Give it the result of a policy, a byte with its iteration; return the figures for the log."""
+    file.write_bytes(bytes([iteration]))
+    result = {"kind": "evaluate", "iteration": iteration, "steps": 16 * iteration, "policy": str(file)}
+    return evaluation._take({**result, "figures": {"score": score, "fall_share": 0.0}})
+
+
+def evaluated_run(run: Path, scores: dict[int, float]) -> None:
+    """A run in which policies had these scores by iteration."""
+    evaluation = evaluating(run)
     (run / "evals").mkdir()
     for iteration, value in scores.items():
-        file = run / f"evals/{iteration:06d}.pt"
-        file.write_bytes(bytes([iteration]))
-        result = {"kind": "evaluate", "iteration": iteration, "steps": 16 * iteration, "policy": str(file)}
-        evaluation._take({**result, "figures": {"score": value, "fall_share": 0.0}})
-    return evaluation
+        figures = take(evaluation, iteration, value, run / f"evals/{iteration:06d}.pt")
+        assert figures == {"eval/iteration": iteration, "eval/score": value, "eval/fall_share": 0.0}
 
 
 def best_of(run: Path) -> tuple[int, int, float]:
@@ -103,17 +98,22 @@ def best_of(run: Path) -> tuple[int, int, float]:
     return (run / "best.pt").read_bytes()[0], row["iteration"], row["score"]
 
 
+def test_the_best_policy_is_that_of_the_lowest_score(tmp_path: Path) -> None:
+    evaluated_run(tmp_path, {1: 0.5, 2: 0.3, 3: 0.4})
+    assert best_of(tmp_path) == (2, 2, 0.3)
+    assert [r["score"] for r in rows(tmp_path / "evals.csv")] == [0.5, 0.3, 0.4]
+
+
 @pytest.mark.parametrize("policies", [True, False])
 def test_a_best_policy_of_later_iterations_gives_way_when_a_run_goes_on_before_it(
     tmp_path: Path, policies: bool
 ) -> None:
     """It was kept, and a worse one of the new rows then took its place, as these knew nothing of it."""
-    config = parse_train(compose("train", [*SMALL, "eval.every=1"]))
     evaluated_run(tmp_path, {1: 0.5, 2: 0.4, 3: 0.2})
     if not policies:  # somebody made room
         for file in (tmp_path / "evals").glob("*.pt"):
             file.unlink()
-    again = AsyncEvaluation(config, tmp_path, 2)
+    again = evaluating(tmp_path, 2)
     assert [r["iteration"] for r in rows(tmp_path / "evals.csv")] == [1, 2]
     assert (tmp_path / "evals/000003.pt").read_bytes() == bytes([3])  # nothing is lost
     if policies:
@@ -121,31 +121,28 @@ def test_a_best_policy_of_later_iterations_gives_way_when_a_run_goes_on_before_i
     else:
         assert not (tmp_path / "best.pt").exists()
         assert not (tmp_path / "best.json").exists()
-    (tmp_path / "new.pt").write_bytes(bytes([33]))
-    result = {"kind": "evaluate", "iteration": 3, "steps": 48, "policy": str(tmp_path / "new.pt")}
-    again._take({**result, "figures": {"score": 0.45, "fall_share": 0.0}})
-    assert best_of(tmp_path) == ((2, 2, 0.4) if policies else (33, 3, 0.45))
+    take(again, 3, 0.45, tmp_path / "new.pt")
+    assert best_of(tmp_path) == ((2, 2, 0.4) if policies else (3, 3, 0.45))
 
 
 def test_a_crash_between_row_and_best_policy_is_made_good(tmp_path: Path) -> None:
-    config = parse_train(compose("train", [*SMALL, "eval.every=1"]))
     evaluated_run(tmp_path, {1: 0.5, 2: 0.2, 3: 0.4})
     table = (tmp_path / "evals.csv").read_text()
     head, first, second, third = table.splitlines(keepends=True)
     (tmp_path / "evals.csv").write_text(head + first + third)  # the row of the best is lost
-    AsyncEvaluation(config, tmp_path, 3)
+    evaluating(tmp_path, 3)
     assert (tmp_path / "evals.csv").read_text() == table
     (tmp_path / "evals.csv").unlink()
-    AsyncEvaluation(config, tmp_path, 3)
+    evaluating(tmp_path, 3)
     assert (tmp_path / "evals.csv").read_text() == head + second
     assert best_of(tmp_path) == (2, 2, 0.2)
     (tmp_path / "evals.csv").write_text(table)
     (tmp_path / "best.pt").write_bytes(bytes([1]))
     (tmp_path / "best.json").write_text(json.dumps({"iteration": 1, "steps": 16, "score": 0.5, "fall_share": 0.0}))
-    AsyncEvaluation(config, tmp_path, 3)  # killed after the row of the second was written
+    evaluating(tmp_path, 3)  # killed after the row of the second was written
     assert best_of(tmp_path) == (2, 2, 0.2)
     (tmp_path / "best.json").write_text('{"iteration": 2, "st')
-    AsyncEvaluation(config, tmp_path, 3)
+    evaluating(tmp_path, 3)
     assert best_of(tmp_path) == (2, 2, 0.2)
 
 
@@ -154,7 +151,7 @@ def test_a_policy_that_waited_before_a_crash_is_not_evaluated_for_the_one_of_now
 ) -> None:
     (tmp_path / "evals").mkdir()
     (tmp_path / "evals/000002.pt").write_bytes(b"of a training that went on otherwise")
-    evaluation = AsyncEvaluation(parse_train(compose("train", [*SMALL, "eval.every=1", "video.every=1"])), tmp_path, 1)
+    evaluation = evaluating(tmp_path, 1, "video.every=1")
     sent = io.StringIO()
     monkeypatch.setattr(evaluation, "_begin", lambda: SimpleNamespace(stdin=sent))
     policy = SimpleNamespace(state_dict=dict)
@@ -165,7 +162,7 @@ def test_a_policy_that_waited_before_a_crash_is_not_evaluated_for_the_one_of_now
 
 @pytest.mark.slow("go1exp/evaluate/", "go1exp/train/")
 def test_a_failure_beside_is_one_line_and_training_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    evaluation = AsyncEvaluation(parse_train(compose("train", [*SMALL, "eval.every=1"])), tmp_path, 0)
+    evaluation = evaluating(tmp_path)
     policy = SimpleNamespace(state_dict=dict)
     evaluation.offer(SimpleNamespace(iteration=1, num_timesteps=16, policy=policy), last=False)  # type: ignore[arg-type]
     assert evaluation.finish(wait=True) == {}

@@ -92,44 +92,27 @@ def test_a_fault_is_one_line_that_names_the_traceback(tmp_path: Path, monkeypatc
 
 PLUGIN = """
 from go1exp.extend import Snapshot, TermSetup, observation, reward
+@{term}
 {body}
 """
+REWARD = "def mine(s):\n    '''Mine.'''\n    "
+OBSERVATION = "class Mine:\n    '''Mine.'''\n    def __init__(self, setup):\n        "
 
 
 @pytest.mark.parametrize(
-    ("body", "term", "status", "said"),
+    ("body", "status", "said"),
     [
-        (
-            "@reward('mine')\ndef mine(s, *, a, b=3):\n    '''Mine.'''",
-            "reward",
-            2,
-            "parameter 'a' needs a type",
-        ),
-        ("@reward('mine')\ndef mine(s, *, a: 'Lngth'):\n    '''Mine.'''", "reward", 2, "has no usable type (name 'Lng"),
-        (
-            "@reward('mine')\ndef mine(s):\n    '''Mine.'''\n    return 3",
-            "reward",
-            2,
-            "reward.mine: gives int, must",
-        ),
-        (
-            "@reward('mine')\ndef mine(s):\n    '''Mine.'''\n    raise RuntimeError('boom')",
-            "reward",
-            1,
-            "reward.mine (mine.py:6): RuntimeError: boom",
-        ),
-        (
-            "@observation('mine', size=1)\nclass Mine:\n    '''Mine.'''\n    def __init__(self, setup):\n        1 / 0",
-            "observation",
-            1,
-            "observation.mine (mine.py:7): ZeroDivisionError: division by zero",
-        ),
+        ("def mine(s, *, a, b=3):\n    '''Mine.'''", 2, "parameter 'a' needs a type"),
+        ("def mine(s, *, a: 'Lngth'):\n    '''Mine.'''", 2, "has no usable type (name 'Lng"),
+        (f"{REWARD}return 3", 2, "reward.mine: gives int, must"),
+        (f"{REWARD}raise RuntimeError('boom')", 1, "reward.mine (mine.py:6): RuntimeError: boom"),
+        (f"{OBSERVATION}1 / 0", 1, "observation.mine (mine.py:7): ZeroDivisionError: division by zero"),
     ],
 )
-def test_a_wrong_term_of_a_user_is_named(body: str, term: str, status: int, said: str, tmp_path: Path) -> None:
-    (tmp_path / "mine.py").write_text(PLUGIN.format(body=body))
-    weight = ".weight=1" if term == "reward" else "={}"
-    words = ["train", "plugins=[mine.py]", f"+{term}.mine{weight}", *small("ppo=paper"), "hydra.run.dir=run"]
+def test_a_wrong_term_of_a_user_is_named(body: str, status: int, said: str, tmp_path: Path) -> None:
+    kind, more, value = ("reward", "", ".weight=1") if body.startswith("def") else ("observation", ", size=1", "={}")
+    (tmp_path / "mine.py").write_text(PLUGIN.format(term=f"{kind}('mine'{more})", body=body))
+    words = ["train", "plugins=[mine.py]", f"+{kind}.mine{value}", *small("ppo=paper"), "hydra.run.dir=run"]
     done = refuse(tmp_path, *words)
     assert said in done.stderr
     assert done.stderr.count("\n") == 1, done.stderr
@@ -152,10 +135,10 @@ def test_choices_of_ones_own_that_are_no_yaml_or_lead_back_are_refused_by_file(t
         assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize("override", ["reward=papr", "rand=tabel1", "terrain=ruff", "event=psh"])
-def test_make_raises_errors_of_go1exp(override: str) -> None:
-    with pytest.raises(ConfigError, match=f"{override}: unknown choice"):
-        go1exp.make([override])
+def test_make_raises_errors_of_go1exp() -> None:
+    for override in ("reward=papr", "rand=tabel1", "terrain=ruff", "event=psh"):
+        with pytest.raises(ConfigError, match=f"{override}: unknown choice"):
+            go1exp.make([override])
 
 
 @pytest.mark.parametrize(

@@ -10,14 +10,13 @@ import sys
 from contextlib import redirect_stderr, redirect_stdout
 from functools import cache
 from pathlib import Path
-from typing import Any
 from unittest import mock
 
 import pytest
 
 from go1exp.cli import EVERY, main
 from go1exp.cli.app import app_of
-from go1exp.cli.helptext import texts_of
+from go1exp.cli.helptext import leaves, texts_of
 from go1exp.config.choices import config_folder, groups_in, groups_of
 from go1exp.config.compose import compose
 from go1exp.config.schema.settings import attributes
@@ -43,13 +42,6 @@ def helped(*words: str) -> str:
         assert main() == 0
     assert complained.getvalue() == ""
     return printed.getvalue()
-
-
-def leaves(settings: dict[str, Any], path: str = "") -> list[str]:
-    keys = []
-    for key, value in settings.items():
-        keys += leaves(value, f"{path}{key}.") if isinstance(value, dict) and value else [path + key]
-    return keys
 
 
 @pytest.mark.parametrize("verb", TITLES)

@@ -48,7 +48,7 @@ def show(verb: str, arguments: Sequence[str]) -> None:
     folders = given_folders(arguments)
     groups = groups_of(verb)
     container = _composed(verb, arguments, folders[1:])
-    keys = _flat(container)
+    keys = leaves(container)
     sections = {key.rpartition(".")[0] for key in keys}
     strange = [word for word in words if word not in {*groups, *keys, *sections}]
     positional = POSITIONAL.get(verb, ())  # words for themselves, as the file in ``go1exp deploy walk.zip --help``
@@ -81,7 +81,7 @@ def _page(verb: str, title: str, container: Mapping[str, Any]) -> list[str]:
         lines += ["", f"  {title} --help {next(iter(groups))}      choices and keys of one group", ""]
     texts = texts_of(verb)
     lines.append("Settings (key=value; these are the values without it):")
-    for key, value in _flat({k: v for k, v in container.items() if k not in groups}).items():
+    for key, value in leaves({k: v for k, v in container.items() if k not in groups}).items():
         shown, remark = ("", "(required) ") if value == "???" else (_plain(value), "")
         lines += _beside(f"{key}={shown}", remark + texts.get(key, ""))
     return [*lines, "", *hydra_help["footer"].rstrip().splitlines()]
@@ -101,9 +101,9 @@ def _group_page(
             path = f"{group}.{key}"
             if isinstance(value, dict) and path in texts:  # a term: its line, then its parameters
                 lines += _beside(path, texts[path])
-                lines += [f"    {name}={_plain(v)}" for name, v in _flat(value, f"{path}.").items()]
+                lines += [f"    {name}={_plain(v)}" for name, v in leaves(value, f"{path}.").items()]
             else:
-                for name, v in _flat({path: value}).items():
+                for name, v in leaves({path: value}).items():
                     lines += _beside(f"{name}={_plain(v)}", texts.get(name, ""))
     return lines + _slots(group)
 
@@ -165,11 +165,11 @@ def _choices(verb: str, group: str, default: str | None) -> str:
     return listed + WITHOUT_IN.get((verb, group), WITHOUT.get(group, "; without it that of training"))
 
 
-def _flat(container: Mapping[str, Any], path: str = "") -> dict[str, Any]:
+def leaves(container: Mapping[str, Any], path: str = "") -> dict[str, Any]:
     """Return the leaves by key path; an empty mapping is a leaf."""
     flat: dict[str, Any] = {}
     for key, value in container.items():
-        flat |= _flat(value, f"{path}{key}.") if isinstance(value, dict) and value else {f"{path}{key}": value}
+        flat |= leaves(value, f"{path}{key}.") if isinstance(value, dict) and value else {f"{path}{key}": value}
     return flat
 
 
