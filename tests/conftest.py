@@ -130,6 +130,18 @@ def make_core(make_task: Callable[..., TaskConfig]) -> Callable[..., Go1Core]:
     return make
 
 
+@pytest.fixture
+def start_core(make_core: Callable[..., Go1Core]) -> Callable[..., Go1Core]:
+    """Build as ``make_core`` does, and begin the first episodes."""
+
+    def start(*overrides: str, **kwargs: Any) -> Go1Core:
+        core = make_core(*overrides, **kwargs)
+        core.reset()
+        return core
+
+    return start
+
+
 @pytest.fixture(scope="session")
 def bundle(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Path of a bundle of two tiny iterations: its policy hardly moves, so that a robot stands."""

@@ -196,11 +196,10 @@ def test_effects_on_gains_reach_the_drive_inside(inner: str, drives: Drives) -> 
     assert tau.flatten().tolist() == pytest.approx([10.0 * 0.1 - 1.0 * 1.0] * 24)
 
 
-def test_effects_on_gains_act_through_a_delay_in_the_environment(make_core: Callable[..., Go1Core]) -> None:
+def test_effects_on_gains_act_through_a_delay_in_the_environment(start_core: Callable[..., Go1Core]) -> None:
     kp: list[Tensor] = []
     for drive in ("pd", "delay"):
-        core = make_core(f"actuator={drive}", "effect=[kp_scale]")
-        core.reset()
+        core = start_core(f"actuator={drive}", "effect=[kp_scale]")
         inside: Any = getattr(core.plant.actuator, "drive", core.plant.actuator)
         kp.append(inside.kp)
     assert torch.equal(*kp)
@@ -579,9 +578,8 @@ def test_effects_on_gains_need_a_drive_that_has_them(
             make_task(effect, *drive)
 
 
-def test_a_net_drives_the_robot(make_core: Callable[..., Go1Core], make_net: Callable[..., Path]) -> None:
-    core = make_core("actuator=net", f"actuator.file={make_net()}")
-    core.reset()
+def test_a_net_drives_the_robot(start_core: Callable[..., Go1Core], make_net: Callable[..., Path]) -> None:
+    core = start_core("actuator=net", f"actuator.file={make_net()}")
     seen = []
     for _ in range(3):
         core.step(torch.zeros(4, 12))

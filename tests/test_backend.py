@@ -215,11 +215,10 @@ def test_contact_counts_are_those_of_mujocos_contact_list_in_any_posture(make_ba
     assert all(count >= 5 for count in seen.values()), seen
 
 
-def test_the_snapshot_names_the_parts_that_touch_and_a_foot_is_no_calf(make_core: Callable[..., Go1Core]) -> None:
+def test_the_snapshot_names_the_parts_that_touch_and_a_foot_is_no_calf(start_core: Callable[..., Go1Core]) -> None:
     """With one physics step per policy step, the flags of the step are those of the pose it began with."""
     n = 150
-    core = make_core("sim.policy_dt=0.002", "rand=none", "event=none", "termination=none", num_envs=n, noise=False)
-    core.reset()
+    core = start_core("sim.policy_dt=0.002", "rand=none", "event=none", "termination=none", num_envs=n, noise=False)
     assert isinstance(core.backend, MujocoCpu)
     qpos, qvel = random_poses(core.backend, n, seed=1)
     core.backend.reset(everyone(n), qpos, qvel)
@@ -255,10 +254,9 @@ def test_the_snapshot_names_the_parts_that_touch_and_a_foot_is_no_calf(make_core
     ids=["belly", "feet", "knees", "back"],
 )
 def test_a_known_posture_touches_with_the_right_part(
-    make_core: Callable[..., Go1Core], joints: list[float], height: float, turn: list[float] | None, touching: set[str]
+    start_core: Callable[..., Go1Core], joints: list[float], height: float, turn: list[float] | None, touching: set[str]
 ) -> None:
-    core = make_core("sim.policy_dt=0.002", "rand=none", "event=none", "termination=none", num_envs=1, noise=False)
-    core.reset()
+    core = start_core("sim.policy_dt=0.002", "rand=none", "event=none", "termination=none", num_envs=1, noise=False)
     quat = Rotation.from_rotvec(turn or [0.0, 0.0, 0.0]).as_quat(scalar_first=True)
     qpos = torch.as_tensor(np.concatenate([[0.0, 0.0, height], quat, np.tile(joints, 12 // len(joints))]))
     core.backend.reset(everyone(1), qpos.unsqueeze(0), torch.zeros(1, 18, dtype=torch.float64))

@@ -62,9 +62,8 @@ CHANGING = (
 @pytest.mark.parametrize(
     "choices", [(*ROUGH, "+observation.height_scan={}"), ("experiment=clock", "backend=cpu"), ("reward=paper_literal",)]
 )
-def test_a_step_holds_nothing_that_a_graph_cannot(choices: tuple[str, ...], make_core: Callable[..., Go1Core]) -> None:
-    core = make_core(*choices)
-    core.reset()
+def test_a_step_holds_nothing_that_a_graph_cannot(choices: tuple[str, ...], start_core: Callable[..., Go1Core]) -> None:
+    core = start_core(*choices)
     with without_engine(core):
         core.step_by_call(torch.zeros(4, 12))  # constants are made once
         with Watch() as watch:

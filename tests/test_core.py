@@ -126,10 +126,9 @@ def test_the_number_of_threads_changes_no_bit(make_core: Make, ground: tuple[str
 
 
 @GROUNDS
-def test_a_saved_environment_continues_bit_for_bit(make_core: Make, ground: tuple[str, ...]) -> None:
+def test_a_saved_environment_continues_bit_for_bit(make_core: Make, start_core: Make, ground: tuple[str, ...]) -> None:
     n, inputs = 4, actions(4, 90)
-    core = make_core(*LIVELY, *ground, num_envs=n, seed=5)
-    core.reset()
+    core = start_core(*LIVELY, *ground, num_envs=n, seed=5)
     list(run(core, inputs[:37]))
     if ground:
         core.level.copy_(torch.tensor([3, 1, 2, 0]))
@@ -142,8 +141,7 @@ def test_a_saved_environment_continues_bit_for_bit(make_core: Make, ground: tupl
     torch.save(state, file)  # which has not moved with the environment
 
     new = make_core(*LIVELY, *ground, num_envs=n, seed=99)
-    used = make_core(*LIVELY, *ground, num_envs=n, seed=98)
-    used.reset()
+    used = start_core(*LIVELY, *ground, num_envs=n, seed=98)
     list(run(used, actions(n, 10, seed=1)))
     for resumed in (new, used):
         file.seek(0)
@@ -182,9 +180,8 @@ def test_another_randomisation_does_not_shift_the_others(make_core: Make) -> Non
 # Episodes
 
 
-def test_an_episode_is_truncated_at_its_time_limit(make_core: Make) -> None:
-    core = make_core(*QUIET, "sim.episode_s=0.2", noise=False)
-    core.reset()
+def test_an_episode_is_truncated_at_its_time_limit(start_core: Make) -> None:
+    core = start_core(*QUIET, "sim.episode_s=0.2", noise=False)
     total = torch.zeros(4)
     for episode in range(3):
         total.zero_()
@@ -233,33 +230,29 @@ def test_a_robot_on_its_back_is_terminated_and_starts_again_while_the_others_go_
     assert ended
 
 
-def test_a_trunk_on_the_ground_is_a_fall_even_when_it_is_level(make_core: Make) -> None:
-    core = make_core("rand=none", "event=none", num_envs=2)
-    core.reset()
+def test_a_trunk_on_the_ground_is_a_fall_even_when_it_is_level(start_core: Make) -> None:
+    core = start_core("rand=none", "event=none", num_envs=2)
     core.backend.qpos[1, 2] = 0.056
     core.backend.qpos[1, 7:] = torch.tensor([0.0, 3.1, -0.9] * 4)
     assert core.step(torch.zeros(2, 12)).terminated.tolist() == [False, True]
 
 
-def test_a_fall_at_the_time_limit_is_a_termination_only(make_core: Make) -> None:
-    core = make_core("rand=none", "event=none", "sim.episode_s=0.02", num_envs=2)
-    core.reset()
+def test_a_fall_at_the_time_limit_is_a_termination_only(start_core: Make) -> None:
+    core = start_core("rand=none", "event=none", "sim.episode_s=0.02", num_envs=2)
     core.backend.qpos[1, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0])
     result = core.step(torch.zeros(2, 12))
     assert result.terminated.tolist() == [False, True]
     assert result.truncated.tolist() == [True, False]
 
 
-def test_first_episodes_may_begin_at_random_times_and_later_ones_at_zero(make_core: Make) -> None:
-    spread = make_core(*QUIET, "sim.episode_s=1.0", num_envs=500, spread_starts=True)
-    spread.reset()
+def test_first_episodes_may_begin_at_random_times_and_later_ones_at_zero(start_core: Make) -> None:
+    spread = start_core(*QUIET, "sim.episode_s=1.0", num_envs=500, spread_starts=True)
     counts = np.bincount(spread.steps.numpy(), minlength=50)
     assert len(counts) == 50
     assert counts.max() < 30  # ten each, if evenly spread
     spread.reset()
     assert not spread.steps.any()
-    together = make_core(*QUIET, num_envs=5)
-    together.reset()
+    together = start_core(*QUIET, num_envs=5)
     assert not together.steps.any()
 
 
@@ -330,9 +323,8 @@ def test_observations_follow_the_list_in_the_configuration(make_core: Make) -> N
     assert torch.equal(observation[:, 45:], core.command.value)
 
 
-def test_actions_are_cut_and_scaled_to_joint_targets_about_the_nominal_stance(make_core: Make) -> None:
-    core = make_core(*QUIET, "action.clip=2.0", "action.scale=0.25", num_envs=1, noise=False)
-    core.reset()
+def test_actions_are_cut_and_scaled_to_joint_targets_about_the_nominal_stance(start_core: Make) -> None:
+    core = start_core(*QUIET, "action.clip=2.0", "action.scale=0.25", num_envs=1, noise=False)
     action = torch.zeros(1, 12)
     action[0, :4] = torch.tensor([1.0, -1.0, 5.0, -torch.inf])
     result = core.step(action)
@@ -375,10 +367,9 @@ def test_a_new_command_is_seen_before_it_is_paid_for(make_task: Callable[..., Ta
     assert changes >= 3 * 30 // 3
 
 
-def test_a_push_is_seen_before_it_is_answered(make_core: Make) -> None:
+def test_a_push_is_seen_before_it_is_answered(start_core: Make) -> None:
     push = ("event.push.interval=[0.1,0.1]", "event.push.velocity=[0.7,0.7]")
-    core = make_core("rand=none", "termination=none", *push, num_envs=2, noise=False)
-    core.reset()
+    core = start_core("rand=none", "termination=none", *push, num_envs=2, noise=False)
     for k, result in enumerate(run(core, torch.zeros(12, 2, 12)), start=1):
         world = Rotation.from_quat(core.backend.qpos[:, 3:7].numpy(), scalar_first=True).apply(
             result["observation"][:, :3]
@@ -395,11 +386,10 @@ def test_a_push_is_seen_before_it_is_answered(make_core: Make) -> None:
 
 @pytest.mark.parametrize(("physics_dt", "substeps"), [(0.002, 10), (0.004, 5), (0.02, 1)])
 def test_a_policy_step_is_that_many_physics_steps_under_the_actuators_law(
-    make_core: Make, physics_dt: float, substeps: int
+    start_core: Make, physics_dt: float, substeps: int
 ) -> None:
     """Against MuJoCo's own step in a loop, with the torque of a PD law written out here."""
-    core = make_core(*QUIET, f"sim.physics_dt={physics_dt}", num_envs=2, noise=False)
-    core.reset()
+    core = start_core(*QUIET, f"sim.physics_dt={physics_dt}", num_envs=2, noise=False)
     model, data = core.backend.model, mujoco.MjData(core.backend.model)
     data.qpos[:], data.qvel[:] = core.backend.qpos[0], core.backend.qvel[0]
     mujoco.mj_forward(model, data)
@@ -449,9 +439,8 @@ def foot_forces(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray,
     return total, total > 0
 
 
-def test_the_snapshot_describes_the_state(make_core: Make) -> None:
-    core = make_core("rand=table1", num_envs=5, noise=False)
-    core.reset()
+def test_the_snapshot_describes_the_state(start_core: Make) -> None:
+    core = start_core("rand=table1", num_envs=5, noise=False)
     for k, action in enumerate(actions(5, 6, 0.5), start=1):
         core.step(action)
         s = core.snapshot()
@@ -496,9 +485,8 @@ def test_an_episode_starts_in_the_nominal_stance_or_where_table_i_says(make_core
 
 
 @pytest.mark.parametrize("when", ["startup", "reset"])
-def test_a_model_is_drawn_once_or_at_each_reset_of_its_own_robot(make_core: Make, when: str) -> None:
-    core = make_core("rand=table1", f"rand.link_mass.when={when}", "event=none", num_envs=3)
-    core.reset()
+def test_a_model_is_drawn_once_or_at_each_reset_of_its_own_robot(start_core: Make, when: str) -> None:
+    core = start_core("rand=table1", f"rand.link_mass.when={when}", "event=none", num_envs=3)
 
     def look() -> tuple[Tensor, Tensor, Tensor]:
         fields = [core.backend.field(f).flatten(1).clone() for f in ("body_mass", "geom_friction", "body_ipos")]
@@ -541,9 +529,8 @@ def test_the_reward_is_weight_times_term_times_period_summed_over_terms(make_tas
     assert core.drain_metrics(steps=1)["reward/five"] == pytest.approx(-5.0)
 
 
-def test_the_reward_is_the_sum_of_the_configured_terms_on_the_snapshot_of_the_step(make_core: Make) -> None:
-    core = make_core(*QUIET, "reward=paper_literal", num_envs=4, noise=False)
-    core.reset()
+def test_the_reward_is_the_sum_of_the_configured_terms_on_the_snapshot_of_the_step(start_core: Make) -> None:
+    core = start_core(*QUIET, "reward=paper_literal", num_envs=4, noise=False)
     weights = {t.key: t.slots["weight"] for t in core.task.reward}
     assert len(weights) == 19
     for action in actions(4, 20, 0.5):
@@ -604,10 +591,9 @@ def test_an_actuator_is_asked_at_the_physics_rate_told_of_resets_and_saved(
 # Rough ground
 
 
-def test_foot_height_over_rough_ground_is_the_height_over_the_field(make_core: Make) -> None:
+def test_foot_height_over_rough_ground_is_the_height_over_the_field(start_core: Make) -> None:
     n = 30
-    core = make_core(*ROUGH, "terrain.cols=5", num_envs=n, noise=False)
-    core.reset()
+    core = start_core(*ROUGH, "terrain.cols=5", num_envs=n, noise=False)
     x_min, x_max, y_min, y_max = core.terrain.extent
     rng = np.random.default_rng(0)
     qpos, qvel = core.backend.qpos.clone(), torch.zeros_like(core.backend.qvel)
@@ -625,19 +611,17 @@ def test_foot_height_over_rough_ground_is_the_height_over_the_field(make_core: M
     assert np.ptp(heights) > 0.1
 
 
-def test_a_foot_that_stands_is_its_radius_above_the_ground(make_core: Make) -> None:
+def test_a_foot_that_stands_is_its_radius_above_the_ground(start_core: Make) -> None:
     for ground in ((), (*TILES, "terrain.ramp_slope=[0.2,0.2]")):
-        core = make_core(*QUIET, *ground, num_envs=3, noise=False)
-        core.reset()
+        core = start_core(*QUIET, *ground, num_envs=3, noise=False)
         list(run(core, torch.zeros(60, 3, 12)))
         s = core.snapshot()
         assert s.foot_contact.all()
         np.testing.assert_allclose(s.foot_height, robot.FOOT_RADIUS, atol=3e-3)
 
 
-def test_a_robot_that_leaves_the_map_is_truncated_and_brought_back(make_core: Make) -> None:
-    core = make_core(*QUIET, *TILES, num_envs=6, noise=False)
-    core.reset()
+def test_a_robot_that_leaves_the_map_is_truncated_and_brought_back(start_core: Make) -> None:
+    core = start_core(*QUIET, *TILES, num_envs=6, noise=False)
     spawn = core.backend.qpos[:, :3].clone()
     x_min, x_max, y_min, y_max = core.terrain.extent
     inside, outside = 1.05, 0.95  # m from the edge
@@ -652,25 +636,22 @@ def test_a_robot_that_leaves_the_map_is_truncated_and_brought_back(make_core: Ma
     np.testing.assert_allclose(core.backend.qpos[4:, :2], places[4:], atol=0.01)
 
 
-def test_flat_ground_has_no_edge(make_core: Make) -> None:
-    core = make_core(*QUIET, num_envs=2)
-    core.reset()
+def test_flat_ground_has_no_edge(start_core: Make) -> None:
+    core = start_core(*QUIET, num_envs=2)
     core.backend.qpos[:, 0] = 1e4
     assert not core.step(torch.zeros(2, 12)).truncated.any()
 
 
-def test_robots_start_in_the_middle_of_their_tile_column_by_column(make_core: Make) -> None:
-    core = make_core(*QUIET, *ROUGH, num_envs=7, first_env=2)
-    core.reset()
+def test_robots_start_in_the_middle_of_their_tile_column_by_column(start_core: Make) -> None:
+    core = start_core(*QUIET, *ROUGH, num_envs=7, first_env=2)
     for i in range(7):
         origin = core.terrain.tile_origins[int(core.level[i]), (i + 2) % 3]
         np.testing.assert_allclose(core.backend.qpos[i, :3], origin + RAISED, atol=1e-6)
 
 
 @pytest.mark.parametrize(("curriculum", "levels"), [("terrain_level", range(6)), ("none", range(10))])
-def test_robots_start_on_random_levels_up_to_the_curriculums(make_core: Make, curriculum: str, levels: range) -> None:
-    core = make_core("terrain=rough", "terrain.cols=2", f"curriculum={curriculum}", num_envs=300)
-    core.reset()
+def test_robots_start_on_random_levels_up_to_the_curriculums(start_core: Make, curriculum: str, levels: range) -> None:
+    core = start_core("terrain=rough", "terrain.cols=2", f"curriculum={curriculum}", num_envs=300)
     assert set(core.level.tolist()) == set(levels)
     core.reset()
     before = core.level.clone()
@@ -697,7 +678,7 @@ COMMANDS = {
         ("standing", 0.0, 0),
     ],
 )
-def test_levels_rise_where_the_commanded_path_is_tracked(walk: str, share: float, moves: int, make_core: Make) -> None:
+def test_levels_rise_where_the_commanded_path_is_tracked(walk: str, share: float, moves: int, start_core: Make) -> None:
     """Trunks that are moved by ``share`` of the commanded twist, exactly, 4 s long."""
     x, y, yaw, hold = COMMANDS[walk]
     command = [
@@ -705,13 +686,12 @@ def test_levels_rise_where_the_commanded_path_is_tracked(walk: str, share: float
         for k, (low, high) in zip(("lin_vel_x", "lin_vel_y", "ang_vel_z"), (x, y, yaw), strict=True)
     ]
     hold_time = f"command.hold_time=[{hold},{hold}]"
-    core = make_core(
+    core = start_core(
         *("rand=none", "event=none", "termination=none", *ROUGH, "command=paper", *command, hold_time),
         *("command.standing_fraction=0.0", "sim.episode_s=4.0"),
         num_envs=6,
         noise=False,
     )
-    core.reset()
     core.level.fill_(1)
     core.reset()
     pose = core.backend.qpos[:, :7].clone()
@@ -735,9 +715,10 @@ def test_levels_rise_where_the_commanded_path_is_tracked(walk: str, share: float
     assert core.level.tolist() == [1 + moves] * 6
 
 
-def test_a_fall_counts_as_the_rest_of_the_path_untracked(make_core: Make) -> None:
-    core = make_core("rand=none", "event=none", *ROUGH, "command=forward", "sim.episode_s=4.0", num_envs=3, noise=False)
-    core.reset()
+def test_a_fall_counts_as_the_rest_of_the_path_untracked(start_core: Make) -> None:
+    core = start_core(
+        "rand=none", "event=none", *ROUGH, "command=forward", "sim.episode_s=4.0", num_envs=3, noise=False
+    )
     core.level.fill_(2)
     core.path.total[:] = torch.tensor([[3.0, 3.0], [3.0, 3.0], [0.0, 0.0]])
     core.steps[:] = torch.tensor([20, 180, 20])  # of 200
@@ -747,9 +728,8 @@ def test_a_fall_counts_as_the_rest_of_the_path_untracked(make_core: Make) -> Non
     assert core.level.tolist() == [1, 3, 1]
 
 
-def test_robots_past_the_top_level_spread_over_all_levels(make_core: Make) -> None:
-    core = make_core(*QUIET, *ROUGH, "sim.episode_s=0.02", num_envs=200, noise=False)
-    core.reset()
+def test_robots_past_the_top_level_spread_over_all_levels(start_core: Make) -> None:
+    core = start_core(*QUIET, *ROUGH, "sim.episode_s=0.02", num_envs=200, noise=False)
     core.level.fill_(3)
     core.path.total[:] = 1.0
     core.backend.qpos[:, 2] = 2.0
@@ -765,10 +745,9 @@ def test_robots_past_the_top_level_spread_over_all_levels(make_core: Make) -> No
 )
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_a_state_that_is_not_finite_is_a_fault_of_that_environment(
-    make_core: Make, elsewhere: None, field: str, column: int, value: float
+    start_core: Make, elsewhere: None, field: str, column: int, value: float
 ) -> None:
-    core = make_core("rand=none", num_envs=3)
-    core.reset()
+    core = start_core("rand=none", num_envs=3)
     core.check(core.step(torch.zeros(3, 12)))
     getattr(core.backend, field)[1, column] = value
     with pytest.raises(NumericalFault, match=r"is not finite in environment 1 at step 2$"):
@@ -777,11 +756,10 @@ def test_a_state_that_is_not_finite_is_a_fault_of_that_environment(
 
 @pytest.mark.parametrize("termination", ["none", "fall"])
 def test_a_state_that_is_not_finite_is_not_blamed_on_the_torque_that_follows_from_it(
-    make_core: Make, elsewhere: None, termination: str
+    start_core: Make, elsewhere: None, termination: str
 ) -> None:
     """MuJoCo takes a torque that is not finite for zero; a state that is not finite counts as a fall."""
-    core = make_core("rand=none", f"termination={termination}", num_envs=3)
-    core.reset()
+    core = start_core("rand=none", f"termination={termination}", num_envs=3)
     core.backend.step(torch.full((3, 12), torch.nan))
     assert torch.isfinite(core.backend.qpos).all()
     core.backend.qpos[1, 9] = torch.nan
@@ -808,9 +786,8 @@ def test_a_reset_heals_an_environment_after_a_fault(make_core: Make, elsewhere: 
     assert torch.isfinite(result.episode_return).all()
 
 
-def test_an_action_that_is_not_finite_is_a_fault_that_names_the_action(make_core: Make, elsewhere: None) -> None:
-    core = make_core("rand=none", num_envs=3)
-    core.reset()
+def test_an_action_that_is_not_finite_is_a_fault_that_names_the_action(start_core: Make, elsewhere: None) -> None:
+    core = start_core("rand=none", num_envs=3)
     action = torch.zeros(3, 12)
     action[2, 5] = torch.nan
     with pytest.raises(NumericalFault, match=r"^action is not finite in environment 2 at step 1$") as caught:

@@ -274,12 +274,11 @@ def test_a_missing_runtime_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         OnnxPolicy(b"", [], [])
 
 
-def test_every_source_is_a_field_and_every_reading_is_given(make_core: Callable[..., Go1Core]) -> None:
+def test_every_source_is_a_field_and_every_reading_is_given(start_core: Callable[..., Go1Core]) -> None:
     assert set(graph.SOURCES) <= {f.name for f in dataclasses.fields(Snapshot)}
     names = [port.name for port in graph.READINGS]
     assert set(graph.SOURCES.values()) == set(names)
-    core = make_core(num_envs=2)
-    core.reset()
+    core = start_core(num_envs=2)
     given = readings(core)
     assert {name: values.shape[1] for name, values in given.items()} == {p.name: p.size for p in graph.READINGS}
 

@@ -24,10 +24,9 @@ LEVEL = (1.0, 0.0, 0.0, 0.0)
 LIMIT = torch.as_tensor(robot.per_joint(robot.EFFORT_LIMIT))
 
 
-def hung(make_core: Make, *overrides: str, n: int = 3) -> Plant:
+def hung(start_core: Make, *overrides: str, n: int = 3) -> Plant:
     """N robots on a stand, in the nominal stance, at rest."""
-    core = make_core(*HUNG, *overrides, num_envs=n, held=LEVEL)
-    core.reset()
+    core = start_core(*HUNG, *overrides, num_envs=n, held=LEVEL)
     return core.plant
 
 

@@ -76,10 +76,9 @@ def test_a_reset_zeroes_its_rows_even_where_they_are_not_finite() -> None:
         assert values.abs().sum(1).gt(0).tolist() == [True, False, True]
 
 
-def test_impacts_of_the_environment_are_those_of_mujocos_own_step(make_core: Callable[..., Go1Core]) -> None:
+def test_impacts_of_the_environment_are_those_of_mujocos_own_step(start_core: Callable[..., Go1Core]) -> None:
     """A robot dropped with bent legs: largest force and speed at first touch from a loop over ``mj_step``."""
-    core = make_core(*QUIET, num_envs=2, noise=False)
-    core.reset()
+    core = start_core(*QUIET, num_envs=2, noise=False)
     core.backend.qpos[:, 2] += 0.05
     model, data = core.backend.model, mujoco.MjData(core.backend.model)
     data.qpos[:], data.qvel[:] = core.backend.qpos[0], core.backend.qvel[0]
@@ -143,10 +142,9 @@ def test_the_speed_of_a_sole_is_that_of_the_lowest_point_of_its_sphere(make_task
 
 
 def test_a_force_that_physics_cannot_make_ends_the_episode_without_a_fall(
-    make_core: Callable[..., Go1Core], monkeypatch: pytest.MonkeyPatch
+    start_core: Callable[..., Go1Core], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    core = make_core(*QUIET, num_envs=3)
-    core.reset()
+    core = start_core(*QUIET, num_envs=3)
     assert not core.terms.distrusts  # a judge believes its engine
     core.terms.distrusts = True
     usual = core.feet.update

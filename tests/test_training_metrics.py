@@ -174,9 +174,8 @@ def test_a_drained_log_begins_anew_with_the_same_names() -> None:
     assert all(math.isnan(v) for v in again.values())
 
 
-def test_the_environment_counts_falls_and_time_outs(make_core: Callable[..., Go1Core]) -> None:
-    core = make_core("sim.episode_s=0.2", "termination=none", num_envs=3)
-    core.reset()
+def test_the_environment_counts_falls_and_time_outs(start_core: Callable[..., Go1Core]) -> None:
+    core = start_core("sim.episode_s=0.2", "termination=none", num_envs=3)
     for _ in range(20):
         result = core.step(torch.zeros(3, 12))
     assert bool(result.truncated.all())

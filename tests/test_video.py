@@ -37,9 +37,8 @@ def gl() -> str:
 
 
 @pytest.fixture
-def core(make_core: MakeCore) -> Go1Core:
-    core = make_core(*PLAIN, num_envs=2)
-    core.reset()
+def core(start_core: MakeCore) -> Go1Core:
+    core = start_core(*PLAIN, num_envs=2)
     return core
 
 
@@ -161,9 +160,8 @@ def test_arrows_show_command_and_velocity(camera: Camera, core: Go1Core) -> None
     assert green() > 30
 
 
-def test_the_drawn_ground_is_the_ground_walked_on(make_core: MakeCore) -> None:
-    core = make_core(*PLAIN, "terrain=rough", num_envs=1)
-    core.reset()
+def test_the_drawn_ground_is_the_ground_walked_on(start_core: MakeCore) -> None:
+    core = start_core(*PLAIN, "terrain=rough", num_envs=1)
     stage, terrain = Stage(core), core.terrain
     edge = 2.0 * GROUND_RANGE / terrain.resolution + 1
     assert stage.model.hfield_data.size == edge**2 < 0.05 * terrain.heights.size
@@ -178,9 +176,8 @@ def test_the_drawn_ground_is_the_ground_walked_on(make_core: MakeCore) -> None:
         assert 9.0 - distance == pytest.approx(float(terrain.height_at((x, y))), abs=1e-6)
 
 
-def test_a_rough_ground_is_drawn_and_exchanged_on_the_way(gl: str, make_core: MakeCore) -> None:
-    core = make_core(*PLAIN, "terrain=rough", num_envs=1)
-    core.reset()
+def test_a_rough_ground_is_drawn_and_exchanged_on_the_way(gl: str, start_core: MakeCore) -> None:
+    core = start_core(*PLAIN, "terrain=rough", num_envs=1)
     camera = Camera(core, 160, 120)
     camera.frame(0)
     core.backend.qpos[0, :3] = torch.tensor([-32.0, 20.0, 0.3])
