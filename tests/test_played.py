@@ -64,11 +64,7 @@ def test_an_excitation_is_played_by_name() -> None:
 
 @pytest.mark.parametrize(
     ("wish", "problem"),
-    [
-        ("squat", "squat.*is for a robot on the ground"),
-        ("torque_off", "switches actuators off"),
-        ("chrip", "chrip"),
-    ],
+    [("squat", "squat.*is for a robot on the ground"), ("torque_off", "switches actuators off"), ("chrip", "chrip")],
 )
 def test_what_a_hung_robot_cannot_do_is_refused(wish: str, problem: str) -> None:
     with pytest.raises(ConfigError, match=problem):

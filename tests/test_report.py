@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import yaml
 from scipy import stats
@@ -20,7 +21,7 @@ from go1exp.cli.report import _task
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError
 from go1exp.config.schema.settings import parse
-from go1exp.evaluate.quantities import rows_of
+from go1exp.evaluate.quantities import rows_of, write_rows
 from go1exp.evaluate.quantities import write as write_evaluation
 from go1exp.evaluate.report import curves
 from go1exp.evaluate.report.results import Report, report
@@ -28,7 +29,9 @@ from go1exp.evaluate.report.settings import ReportSettings
 from go1exp.evaluate.report.study import baseline, groups, study
 from go1exp.evaluate.report.tables import plain_rows, tables
 from go1exp.evaluate.report.writing import page, write
+from go1exp.train import run_state
 from tests.phone import PHONE, needs_chromium, on_a_phone
+from tests.small_run import trained
 
 CONFIG: dict[str, Any] = {
     "seed": 0,
@@ -227,8 +230,6 @@ def test_figures_are_means_of_runs_and_shares_have_three_intervals(two_groups: P
 
 
 def table_of_run(folder: Path) -> dict[str, list[float]]:
-    import pyarrow.parquet as pq
-
     columns: dict[str, list[float]] = pq.read_table(folder / "eval.parquet").to_pydict()
     return columns
 
@@ -295,8 +296,6 @@ def test_without_anything_random_there_are_no_robots_to_pair(tmp_path: Path) -> 
 
 def kicked(folder: Path, evaluated: bool = False) -> None:
     """Write two groups of six runs that were kicked; with a larger weight they recover sooner."""
-    from go1exp.evaluate.quantities import write_rows
-
     protocol = compose("eval", ["protocol=kicks"])["protocol"]["kicks"]
     for seed in range(6):
         for group, level in ((10.0, 1.0), (0.0, 2.0)):
@@ -407,8 +406,6 @@ def test_protocols_of_another_version_are_named_and_the_others_stay(
 
 
 def test_rows_without_a_column_that_others_have_are_left_out(tmp_path: Path) -> None:
-    import pyarrow.parquet as pq
-
     kicked(tmp_path, evaluated=True)
     for name, lost in (("protocols/kicks.parquet", "impulse"), ("eval.parquet", "robot")):
         file = tmp_path / "g0s0" / name
@@ -504,20 +501,11 @@ def test_the_page_needs_nothing_beside_it(two_groups: Path) -> None:
     text = page(made(two_groups))
     assert not re.search(r'(?:src|href)="(?!#)', text)
     assert "@import" not in text
-    for words in (
-        "grid: comparison with the baseline",
-        "grid: results",
-        "grid: sensitivity",
-        "rollout/return",
-        "Groups",
-    ):
-        assert words in text
+    titles = ("grid: comparison with the baseline", "grid: results", "grid: sensitivity", "rollout/return", "Groups")
+    assert [title for title in titles if title not in text] == []
 
 
 def test_eval_true_evaluates_what_is_missing_with_the_runs_own_policy(tmp_path: Path) -> None:
-    from go1exp.train import run_state
-    from tests.small_run import trained
-
     trained(tmp_path / "r", "ppo.iterations=1")
     run_state.write(tmp_path / "r", "done")
     brief = {"x": [0.5], "y": [], "yaw": [], "episodes": 3, "duration_s": 0.2, "settle_s": 0.1}

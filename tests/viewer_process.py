@@ -16,14 +16,13 @@ from typing import Any
 
 import torch
 
-from go1exp.cli.play_web import _agents, _grounds
-from go1exp.cli.subjects import agent, named
 from go1exp.evaluate.viewer import web
 from go1exp.evaluate.viewer.drive_window import DriveWindow
 from go1exp.evaluate.viewer.page_server import Gamepad
-from go1exp.evaluate.viewer.requests import Setup, catalogue
-from go1exp.evaluate.viewer.session import Robots, Session
+from go1exp.evaluate.viewer.requests import Setup
+from go1exp.evaluate.viewer.session import Session
 from go1exp.evaluate.viewer.walk import WalkShow
+from tests.test_viewer import clock_robots
 
 EVERY_S = 0.1
 
@@ -78,9 +77,7 @@ class TellingWindow(DriveWindow):
 def main() -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where pytest runs in a shell's background
     torch.set_num_threads(1)
-    first = agent(named(None, "clock", None, None, "play.mp4"), {})
-    subject = named(None, "clock", None, None, "play.mp4")
-    robots = Robots(_agents(subject, first, {}), _grounds(None)[1], catalogue(first.task.effect, False)[0])
+    robots = clock_robots()
     session = Session(robots, "clock", Setup(), (0.0, 0.0, 0.0))
     pad = Gamepad()
     web.run(

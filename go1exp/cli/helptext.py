@@ -25,11 +25,7 @@ from go1exp.config.schema.registry import ConfigError, members, nearest, unknown
 KEY_WIDTH = 34
 """Columns of ``key=value`` before the text beside it."""
 
-WITHOUT = {
-    "experiment": "",
-    "study": "",
-    "terrain": "; without it flat, or that of training with train_ground=true",
-}
+WITHOUT = {"experiment": "", "study": "", "terrain": "; without it flat, or that of training with train_ground=true"}
 """Group without a default choice -> remark in its line; all others then keep the choice of training."""
 
 WITHOUT_IN = {

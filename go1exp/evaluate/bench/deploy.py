@@ -53,11 +53,7 @@ LITTLE = {"num_envs": 4, "steps": 4, "minibatches": 2, "epochs": 1, "iterations"
 
 
 def run(
-    container: dict[str, Any],
-    num_envs: int,
-    rounds: int,
-    seconds: float,
-    on_round: Callable[[int, int], None],
+    container: dict[str, Any], num_envs: int, rounds: int, seconds: float, on_round: Callable[[int, int], None]
 ) -> dict[str, float]:
     """Measure; return the medians over the rounds by name. ``container`` is a training's configuration."""
     little = container | {"ppo": container["ppo"] | LITTLE}

@@ -43,11 +43,7 @@ def wrapped(angle: float) -> float:
 def roll_pitch_yaw(rotation: np.ndarray) -> tuple[float, float, float]:
     """Return the angles of R = R_z(yaw) R_y(pitch) R_x(roll), rad."""
     down = max(-1.0, min(1.0, float(rotation[2, 0])))
-    return (
-        math.atan2(rotation[2, 1], rotation[2, 2]),
-        -math.asin(down),
-        math.atan2(rotation[1, 0], rotation[0, 0]),
-    )
+    return (math.atan2(rotation[2, 1], rotation[2, 2]), -math.asin(down), math.atan2(rotation[1, 0], rotation[0, 0]))
 
 
 class Smoothed:
