@@ -47,40 +47,24 @@ class Left(BaseException):
 
 @dataclass(frozen=True)
 class Sweep:
-    """A requested sweep.
+    """A requested sweep."""
 
-    Attributes:
-        folder: of the sweep.
-        jobs: overrides of each job.
-        launcher: ``hydra.launcher``, as plain data.
-    """
-
-    folder: Path
-    jobs: list[list[str]]
-    launcher: dict[str, Any]
+    folder: Path  # of the sweep
+    jobs: list[list[str]]  # overrides of each job
+    launcher: dict[str, Any]  # ``hydra.launcher``, as plain data
 
 
 @dataclass(frozen=True)
 class Job:
-    """The job that is running.
+    """The job that is running."""
 
-    Attributes:
-        folder: run folder.
-        multirun: whether it is one of several.
-        number: among them.
-        overrides: of the configuration, as given.
-        of_hydra: overrides of Hydra's own configuration.
-        study: chosen study that lists values to sweep over, if there is one.
-        launcher: ``hydra.launcher``, as plain data.
-    """
-
-    folder: Path
-    multirun: bool
-    number: int
-    overrides: list[str]
-    of_hydra: list[str]
-    study: str | None
-    launcher: dict[str, Any]
+    folder: Path  # run folder
+    multirun: bool  # whether it is one of several
+    number: int  # among them
+    overrides: list[str]  # of the configuration, as given
+    of_hydra: list[str]  # overrides of Hydra's own configuration
+    study: str | None  # chosen study that lists values to sweep over, if there is one
+    launcher: dict[str, Any]  # ``hydra.launcher``, as plain data
 
 
 def output_folder() -> Path:

@@ -116,23 +116,14 @@ def controller_maker(settings: MpcSettings, task: TaskConfig) -> Callable[[], Co
 
 @dataclass(frozen=True)
 class Named:
-    """A subject whose files are there.
+    """A subject whose files are there."""
 
-    Attributes:
-        label: name in reports.
-        folder: default place of its results.
-        run: run folder, of a run or of a shipped policy.
-        checkpoint: one of its checkpoints; None takes the newest.
-        bundle: file, in place of a run.
-        controller: in place of a policy; ``run`` then names the run of the robot that it moves.
-    """
-
-    label: str
-    folder: Path
-    run: Path | None = None
-    checkpoint: Path | None = None
-    bundle: Path | None = None
-    controller: MpcSettings | None = None
+    label: str  # name in reports
+    folder: Path  # default place of its results
+    run: Path | None = None  # run folder, of a run or of a shipped policy
+    checkpoint: Path | None = None  # one of its checkpoints; None takes the newest
+    bundle: Path | None = None  # file, in place of a run
+    controller: MpcSettings | None = None  # in place of a policy; ``run`` then names the run of the robot that it moves
 
 
 def driven(controller: MpcSettings, run: str | None, policy: str | None, bundle: str | None, file: str) -> Named:
@@ -175,17 +166,11 @@ VELOCITIES: dict[str, Literal["exact", "estimated"]] = {"exact": "exact", "estim
 
 @dataclass(frozen=True)
 class Variation:
-    """How a subject is played, where that differs from the protocol and from its training.
+    """How a subject is played, where that differs from the protocol and from its training."""
 
-    Attributes:
-        policy_dt: period of the policy, s; None keeps it.
-        trunk_velocity: what the policy sees of it; None keeps it.
-        engine: physics engine; None is MuJoCo.
-    """
-
-    policy_dt: float | None = None
-    engine: BackendConfig | None = None
-    trunk_velocity: Literal["exact", "estimated"] | None = None
+    policy_dt: float | None = None  # period of the policy, s; None keeps it
+    engine: BackendConfig | None = None  # physics engine; None is MuJoCo
+    trunk_velocity: Literal["exact", "estimated"] | None = None  # what the policy sees of it; None keeps it
 
 
 def varied(given: str, file: str) -> tuple[Named, Variation]:

@@ -36,20 +36,15 @@ LOG = "job.log"
 
 @dataclass(frozen=True)
 class Rules:
-    """Functions of a verb for its jobs.
+    """Functions of a verb for its jobs."""
 
-    Attributes:
-        resolve: ``(container, overrides, run folder) -> job``; raises ConfigError; touches no file.
-        check: raises ConfigError, or another error that is an answer, if a job cannot run here.
-        plan: makes the run folder of a job, unless it has begun.
-        planned: ``(run folder, overrides) -> job`` of a folder that was made; raises ConfigError.
-        go_on: ``(run folder, overrides) -> exit status``, runs it in this process.
-    """
-
+    # ``(container, overrides, run folder) -> job``; raises ConfigError; touches no file
     resolve: Callable[[dict[str, Any], list[str], Path], Any]
-    check: Callable[[Any], None]
-    plan: Callable[[Any], None]
+    check: Callable[[Any], None]  # raises ConfigError, or another error that is an answer, if a job cannot run here
+    plan: Callable[[Any], None]  # makes the run folder of a job, unless it has begun
+    # ``(run folder, overrides) -> job`` of a folder that was made; raises ConfigError
     planned: Callable[[Path, list[str]], Any]
+    # ``(run folder, overrides) -> exit status``, runs it in this process
     go_on: Callable[[Path, list[str]], int | None]
 
 

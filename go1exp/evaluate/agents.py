@@ -46,19 +46,12 @@ class RunningAgent(Protocol):
 
 @dataclass(frozen=True)
 class Agent:
-    """What moves robots in an evaluation, before there are any.
+    """What moves robots in an evaluation, before there are any."""
 
-    Attributes:
-        label: name in reports.
-        task: the robot, rates and observations that it was made for.
-        about: plain data on its origin, for reports.
-        senses: whether it reads the robots' sensors itself, the IMU too, at a rate of its own.
-    """
-
-    label: str
-    task: TaskConfig
-    about: dict[str, Any] = field(default_factory=dict, kw_only=True)
-    senses: ClassVar[bool] = False
+    label: str  # name in reports
+    task: TaskConfig  # the robot, rates and observations that it was made for
+    about: dict[str, Any] = field(default_factory=dict, kw_only=True)  # plain data on its origin, for reports
+    senses: ClassVar[bool] = False  # whether it reads the robots' sensors itself, the IMU too, at a rate of its own
 
     def problems(self, trunk_velocity: TrunkVelocity, key: str) -> list[str]:
         """Return why it cannot be played so, each message beginning with the ``key`` of the setting."""

@@ -36,20 +36,14 @@ DIGITS = 6  # significant digits in the file
 
 @dataclass(frozen=True)
 class Column:
-    """One figure of a robot.
+    """One figure of a robot."""
 
-    Attributes:
-        name: of the column.
-        unit: of its values; "" for a share.
-        meaning: in words.
-        how: mean over robots, share of robots for which it is true (Wilson), or phase on a circle.
-        better: the direction that is better, for comparisons; None if neither is.
-    """
-
-    name: str
-    unit: str
-    meaning: str
+    name: str  # of the column
+    unit: str  # of its values; "" for a share
+    meaning: str  # in words
+    # mean over robots, share of robots for which it is true (Wilson), or phase on a circle
     how: Literal["mean", "share", "phase"] = "mean"
+    # the direction that is better, for comparisons; None if neither is
     better: Literal["lower", "higher"] | None = None
 
 
@@ -62,22 +56,14 @@ LIFE = (FELL, LEFT, MOVING)
 
 @dataclass(frozen=True)
 class Derived:
-    """A figure of all robots together, such as a threshold.
+    """A figure of all robots together, such as a threshold."""
 
-    Attributes:
-        name: of the figure.
-        unit: of it.
-        meaning: in words.
-        condition: what it is about.
-        better: the direction that is better.
-        function: figure of some rows; NaN where it is not defined. Its interval is by the bootstrap over robots.
-    """
-
-    name: str
-    unit: str
-    meaning: str
-    condition: Mapping[str, Any]
-    better: Literal["lower", "higher"] | None
+    name: str  # of the figure
+    unit: str  # of it
+    meaning: str  # in words
+    condition: Mapping[str, Any]  # what it is about
+    better: Literal["lower", "higher"] | None  # the direction that is better
+    # figure of some rows; NaN where it is not defined. Its interval is by the bootstrap over robots
     function: Callable[[Sequence[Row]], float]
 
 

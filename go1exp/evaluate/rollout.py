@@ -36,37 +36,22 @@ AXES = ("x", "y", "yaw")
 
 @dataclass(frozen=True)
 class EvalConfig:
-    """Settings of an evaluation.
+    """Settings of an evaluation."""
 
-    Attributes:
-        commands: the grid.
-        episodes: episodes of each command.
-        duration_s: length of an episode, s.
-        settle_s: time at its start that counts for falls but not for tracking, s.
-        noise: add the observation noise of training.
-        randomize: randomise robots and starts as in training; if not, the nominal robot.
-        push: push as in training.
-        train_ground: use the ground of training; if not, flat ground.
-        policy_dt: another period of the policy, s, or None for that of training.
-        seed: seed of everything random.
-        physics_dt: another physics step, s, or None for that of training.
-        trunk_velocity: velocity that the policy observes: ``exact``, or ``estimated`` from the sensors by the filter.
-        engine: what moves the robots, or None for MuJoCo on the processor.
-    """
-
-    commands: tuple[Command, ...]
-    episodes: int
-    duration_s: float
-    settle_s: float = 0.0
-    noise: bool = False
-    randomize: bool = False
-    push: bool = False
-    train_ground: bool = False
-    policy_dt: float | None = None
-    seed: int = 1
-    physics_dt: float | None = None
+    commands: tuple[Command, ...]  # the grid
+    episodes: int  # episodes of each command
+    duration_s: float  # length of an episode, s
+    settle_s: float = 0.0  # time at its start that counts for falls but not for tracking, s
+    noise: bool = False  # add the observation noise of training
+    randomize: bool = False  # randomise robots and starts as in training; if not, the nominal robot
+    push: bool = False  # push as in training
+    train_ground: bool = False  # use the ground of training; if not, flat ground
+    policy_dt: float | None = None  # another period of the policy, s, or None for that of training
+    seed: int = 1  # seed of everything random
+    physics_dt: float | None = None  # another physics step, s, or None for that of training
+    # velocity that the policy observes: ``exact``, or ``estimated`` from the sensors by the filter
     trunk_velocity: TrunkVelocity = "exact"
-    engine: BackendConfig | None = None
+    engine: BackendConfig | None = None  # what moves the robots, or None for MuJoCo on the processor
 
     @property
     def random(self) -> bool:

@@ -39,63 +39,38 @@ def solver() -> Any:
 
 @dataclass(frozen=True)
 class Body:
-    """The robot as one rigid body.
+    """The robot as one rigid body."""
 
-    Attributes:
-        mass: kg.
-        inertia: (3, 3) about the centre of mass, trunk frame, kg m2.
-    """
-
-    mass: float
-    inertia: np.ndarray
+    mass: float  # kg
+    inertia: np.ndarray  # (3, 3) about the centre of mass, trunk frame, kg m2
 
 
 @dataclass(frozen=True)
 class Problem:
-    """One programme, in a frame that is horizontal and has the robot's heading at the first instant.
+    """One programme, in a frame that is horizontal and has the robot's heading at the first instant."""
 
-    Attributes:
-        state: (4, 3) roll-pitch-yaw rad, position of the centre of mass m, angular velocity rad/s, velocity m/s.
-        reference: (K, 4, 3) the same, wanted at the end of each interval.
-        arms: (K, 4, 3) from the wanted centre of mass to each foot, in each interval, m.
-        stands: (K, 4) bool: the feet that push in each interval.
-        ground: (3, 3) columns are two tangents and the normal of the ground.
-        attitude: (3, 3) rotation of the trunk for its inertia.
-    """
-
+    # (4, 3) roll-pitch-yaw rad, position of the centre of mass m, angular velocity rad/s, velocity m/s
     state: np.ndarray
-    reference: np.ndarray
-    arms: np.ndarray
-    stands: np.ndarray
-    ground: np.ndarray
-    attitude: np.ndarray
+    reference: np.ndarray  # (K, 4, 3) the same, wanted at the end of each interval
+    arms: np.ndarray  # (K, 4, 3) from the wanted centre of mass to each foot, in each interval, m
+    stands: np.ndarray  # (K, 4) bool: the feet that push in each interval
+    ground: np.ndarray  # (3, 3) columns are two tangents and the normal of the ground
+    attitude: np.ndarray  # (3, 3) rotation of the trunk for its inertia
 
 
 @dataclass(frozen=True)
 class Structure:
-    """Parts of a programme that depend on the schedule alone; n foot intervals, three columns each.
+    """Parts of a programme that depend on the schedule alone; n foot intervals, three columns each."""
 
-    Attributes:
-        interval: (n,) of each.
-        foot: (n,) of each.
-        column_interval: (3 n,) interval of each column.
-        places: (3 n, 3 n) sum over the horizon of products of two columns' shares in a place.
-        speeds: (3 n, 3 n) the same of their shares in a speed.
-        A: (4 n, 3 n) rows of the friction pyramids.
-        upper: (7 n,) upper bounds of forces and rows.
-        lower: (7 n,) lower bounds.
-        sense: (7 n,) the solver's kinds of bounds: all may be active.
-    """
-
-    interval: np.ndarray
-    foot: np.ndarray
-    column_interval: np.ndarray
-    places: np.ndarray
-    speeds: np.ndarray
-    A: np.ndarray
-    upper: np.ndarray
-    lower: np.ndarray
-    sense: np.ndarray
+    interval: np.ndarray  # (n,) of each
+    foot: np.ndarray  # (n,) of each
+    column_interval: np.ndarray  # (3 n,) interval of each column
+    places: np.ndarray  # (3 n, 3 n) sum over the horizon of products of two columns' shares in a place
+    speeds: np.ndarray  # (3 n, 3 n) the same of their shares in a speed
+    A: np.ndarray  # (4 n, 3 n) rows of the friction pyramids
+    upper: np.ndarray  # (7 n,) upper bounds of forces and rows
+    lower: np.ndarray  # (7 n,) lower bounds
+    sense: np.ndarray  # (7 n,) the solver's kinds of bounds: all may be active
 
 
 MOST_STRUCTURES = 500

@@ -19,23 +19,14 @@ TrunkVelocity = Literal["exact", "estimated"]
 
 @dataclass(frozen=True)
 class Sensed:
-    """Sensor readings and estimate at one instant. Legs and joints in the order of ``go1exp.robot``.
+    """Sensor readings and estimate at one instant. Legs and joints in the order of ``go1exp.robot``."""
 
-    Attributes:
-        joint_pos: (12,) rad.
-        joint_vel: (12,) rad/s.
-        quat: (4,) attitude of the trunk in the world, w-x-y-z; its heading may drift.
-        gyro: (3,) angular velocity, trunk frame, rad/s.
-        velocity_b: (3,) estimated velocity of the trunk's origin, trunk frame, m/s.
-        foot_force: (4,) N.
-    """
-
-    joint_pos: np.ndarray
-    joint_vel: np.ndarray
-    quat: np.ndarray
-    gyro: np.ndarray
-    velocity_b: np.ndarray
-    foot_force: np.ndarray
+    joint_pos: np.ndarray  # (12,) rad
+    joint_vel: np.ndarray  # (12,) rad/s
+    quat: np.ndarray  # (4,) attitude of the trunk in the world, w-x-y-z; its heading may drift
+    gyro: np.ndarray  # (3,) angular velocity, trunk frame, rad/s
+    velocity_b: np.ndarray  # (3,) estimated velocity of the trunk's origin, trunk frame, m/s
+    foot_force: np.ndarray  # (4,) N
 
 
 class Controller(Protocol):

@@ -35,23 +35,15 @@ Point = tuple[Coordinate, Coordinate, Coordinate]
 
 @dataclass(frozen=True)
 class Cause:
-    """A setting that determines the length of a batch.
+    """A setting that determines the length of a batch."""
 
-    Attributes:
-        key: its name.
-        value: its value.
-        least: its lower bound.
-        fitting: length, s -> the value that makes the batch so long, all other settings unchanged.
-        unit: of the value.
-        falling: whether the length falls as the value grows.
-    """
-
-    key: str
-    value: float
-    least: float = 0.0
+    key: str  # its name
+    value: float  # its value
+    least: float = 0.0  # its lower bound
+    # length, s -> the value that makes the batch so long, all other settings unchanged
     fitting: Callable[[float], float] = lambda seconds: seconds
-    unit: str = " s"
-    falling: bool = False
+    unit: str = " s"  # of the value
+    falling: bool = False  # whether the length falls as the value grows
 
     def limit(self, seconds: float) -> str | None:
         """Return the limit of the value for a length of ``seconds`` as text; None if that is out of bounds."""
@@ -65,38 +57,23 @@ class Cause:
 
 @dataclass(frozen=True)
 class Length:
-    """Length of one batch of robots.
+    """Length of one batch of robots."""
 
-    Attributes:
-        seconds: the length, s.
-        robots: number of robots.
-        causes: settings that determine the length, the likeliest to be wrong first.
-        settle_s: time at its start that does not count, s.
-        recorded: whether the channels of measures are recorded after it.
-        policy_dt: period of their policy, s; None is that of the stage.
-    """
-
-    seconds: float
-    robots: int
-    causes: Sequence[Cause]
-    settle_s: float = 0.0
-    recorded: bool = False
-    policy_dt: float | None = None
+    seconds: float  # the length, s
+    robots: int  # number of robots
+    causes: Sequence[Cause]  # settings that determine the length, the likeliest to be wrong first
+    settle_s: float = 0.0  # time at its start that does not count, s
+    recorded: bool = False  # whether the channels of measures are recorded after it
+    policy_dt: float | None = None  # period of their policy, s; None is that of the stage
 
 
 @dataclass
 class Played:
-    """Rows and curves of a protocol.
+    """Rows and curves of a protocol."""
 
-    Attributes:
-        rows: one for each robot in each condition.
-        curves: plain data for drawings, by name.
-        notes: remarks for the reader of the report.
-    """
-
-    rows: list[Row]
-    curves: dict[str, Any] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
+    rows: list[Row]  # one for each robot in each condition
+    curves: dict[str, Any] = field(default_factory=dict)  # plain data for drawings, by name
+    notes: list[str] = field(default_factory=list)  # remarks for the reader of the report
 
 
 @settings

@@ -41,20 +41,14 @@ class Claim:
 
 @dataclass(frozen=True)
 class Verdict:
-    """A claim and its worst condition.
-
-    Attributes:
-        word: met, close, not met or inconclusive.
-        figure: figure of the worst condition with its 95 % interval.
-        conditions: number of conditions with the figure.
-    """
+    """A claim and its worst condition."""
 
     name: str
-    word: Word
+    word: Word  # met, close, not met or inconclusive
     claim: Claim
-    figure: Interval
+    figure: Interval  # figure of the worst condition with its 95 % interval
     condition: Mapping[str, Any]
-    conditions: int
+    conditions: int  # number of conditions with the figure
 
 
 def verdict(figure: Interval, claim: Claim) -> Word:

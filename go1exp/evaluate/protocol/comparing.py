@@ -27,25 +27,18 @@ DRAWS = 200
 
 @dataclass(frozen=True)
 class Difference:
-    """Difference of one figure between a subject and the first one.
-
-    Attributes:
-        first: figure of the first subject over the pairs.
-        other: figure of the other subject.
-        difference: other - first with its interval; n is the number of pairs.
-        word: whether the other subject is better.
-        needed: sample size for 80 % power at this difference, in pairs (robots, for a figure of all robots); None if it
-            is significant or zero.
-    """
+    """Difference of one figure between a subject and the first one."""
 
     subject: str
     quantity: str
     unit: str
     condition: dict[str, Any]
-    first: float
-    other: float
-    difference: Interval
-    word: Word
+    first: float  # figure of the first subject over the pairs
+    other: float  # figure of the other subject
+    difference: Interval  # other - first with its interval; n is the number of pairs
+    word: Word  # whether the other subject is better
+    # sample size for 80 % power at this difference, in pairs (robots, for a figure of all robots); None if it is
+    # significant or zero
     needed: int | None
 
 

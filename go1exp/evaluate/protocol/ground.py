@@ -81,16 +81,11 @@ SHAPES: dict[str, tuple[Callable[[Field, Field, float, np.random.Generator], Fie
 
 @dataclass(frozen=True)
 class Lanes(TerrainConfig):
-    """Lanes of rising difficulty; what it has of ``TerrainConfig`` beside ``seed`` is not used.
-
-    Attributes:
-        ground: which.
-        levels: difficulty of each lane, in its unit.
-    """
+    """Lanes of rising difficulty; what it has of ``TerrainConfig`` beside ``seed`` is not used."""
 
     kind: Literal["flat", "tiles"] = "tiles"
-    ground: GroundName = "slope_up"
-    levels: tuple[float, ...] = (0.0,)
+    ground: GroundName = "slope_up"  # which
+    levels: tuple[float, ...] = (0.0,)  # difficulty of each lane, in its unit
 
     def build(self) -> Terrain:
         """Build the lanes; the start of each is its tile's origin, row 0."""

@@ -97,51 +97,33 @@ STEP_BYTES = 8 * (3 + 3 + 3 + 3) + 1
 
 @dataclass(frozen=True)
 class Impulses:
-    """P kicks on each of N robots: F(t) = J pi / (2 T) sin(pi t / T) for T s, whose integral is J.
+    """P kicks on each of N robots: F(t) = J pi / (2 T) sin(pi t / T) for T s, whose integral is J."""
 
-    Attributes:
-        start: (N, P) times at which they begin, s; NaN for none.
-        size: (N, P) J, N s.
-        direction: (N, P) angle of the force from the robot's heading at that time, counter-clockwise, rad.
-        duration: T, s.
-        point: where they act, in the trunk's frame from its origin, m.
-    """
-
-    start: NDArray[np.float64]
-    size: NDArray[np.float64]
+    start: NDArray[np.float64]  # (N, P) times at which they begin, s; NaN for none
+    size: NDArray[np.float64]  # (N, P) J, N s
+    # (N, P) angle of the force from the robot's heading at that time, counter-clockwise, rad
     direction: NDArray[np.float64]
-    duration: float
-    point: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    duration: float  # T, s
+    point: tuple[float, float, float] = (0.0, 0.0, 0.0)  # where they act, in the trunk's frame from its origin, m
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What N robots are to do.
+    """What N robots are to do."""
 
-    Attributes:
-        command: (T, N, 3) commanded velocity of each policy step.
-        impulses: kicks, or None.
-        ground: what they walk on.
-        friction: range of the feet's friction on it, in place of the randomisation's; None keeps that.
-        delay: (N,) further command delay, s; None for none.
-        policy_dt: period of the policy, s; None keeps that of the stage.
-        listen_from: policy step from which contacts, torques and the like are recorded; None records none.
-        steer: turn the robots back into their lanes: yaw rate per rad of heading and per m beside the lane; None
-            does not.
-        trunk_velocity: what the policy sees of it; None keeps that of the stage.
-        finish: way along the world's x, m, after which a robot is done: when all are, or are down, it ends; None plays
-            all steps.
-    """
-
-    command: Array
-    impulses: Impulses | None = None
-    ground: TerrainConfig = dataclasses.field(default_factory=TerrainConfig)
+    command: Array  # (T, N, 3) commanded velocity of each policy step
+    impulses: Impulses | None = None  # kicks, or None
+    ground: TerrainConfig = dataclasses.field(default_factory=TerrainConfig)  # what they walk on
+    # range of the feet's friction on it, in place of the randomisation's; None keeps that
     friction: tuple[float, float] | None = None
-    delay: Array | None = None
-    policy_dt: float | None = None
+    delay: Array | None = None  # (N,) further command delay, s; None for none
+    policy_dt: float | None = None  # period of the policy, s; None keeps that of the stage
+    # policy step from which contacts, torques and the like are recorded; None records none
     listen_from: int | None = None
+    # turn the robots back into their lanes: yaw rate per rad of heading and per m beside the lane; None does not
     steer: tuple[float, float] | None = None
-    trunk_velocity: TrunkVelocity | None = None
+    trunk_velocity: TrunkVelocity | None = None  # what the policy sees of it; None keeps that of the stage
+    # way along the world's x, m, after which a robot is done: when all are, or are down, it ends; None plays all steps
     finish: float | None = None
 
     @property
@@ -152,33 +134,19 @@ class Plan:
 
 @dataclass(frozen=True)
 class Motion:
-    """What N robots did in T policy steps; values are those at the end of a step.
+    """What N robots did in T policy steps; values are those at the end of a step."""
 
-    Attributes:
-        dt: period of the policy, s.
-        t: (T,) s since the start.
-        command: (T, N, 3) as it was given; x, y in m/s, yaw rate in rad/s.
-        velocity: (T, N, 3) of the trunk in its frame: x, y in m/s, yaw rate in rad/s.
-        height: (T, N) of the trunk's origin over the ground below it, m.
-        way: (T, N) m along the world's x from the start.
-        alive: (T, N) bool, not fallen and on the map so far.
-        fell: (N,) bool.
-        left_map: (N,) bool.
-        front_right: (T, N) time for which the foot FR has been on the ground, 0 in the air, s.
-        trace: contacts and the like of the recorded steps, or None.
-    """
-
-    dt: float
-    t: Array
-    command: Array
-    velocity: Array
-    height: Array
-    way: Array
-    alive: NDArray[np.bool_]
-    fell: NDArray[np.bool_]
-    left_map: NDArray[np.bool_]
-    front_right: Array
-    trace: Trace | None = None
+    dt: float  # period of the policy, s
+    t: Array  # (T,) s since the start
+    command: Array  # (T, N, 3) as it was given; x, y in m/s, yaw rate in rad/s
+    velocity: Array  # (T, N, 3) of the trunk in its frame: x, y in m/s, yaw rate in rad/s
+    height: Array  # (T, N) of the trunk's origin over the ground below it, m
+    way: Array  # (T, N) m along the world's x from the start
+    alive: NDArray[np.bool_]  # (T, N) bool, not fallen and on the map so far
+    fell: NDArray[np.bool_]  # (N,) bool
+    left_map: NDArray[np.bool_]  # (N,) bool
+    front_right: Array  # (T, N) time for which the foot FR has been on the ground, 0 in the air, s
+    trace: Trace | None = None  # contacts and the like of the recorded steps, or None
 
     @property
     def moving_s(self) -> Array:

@@ -23,27 +23,16 @@ from go1exp.evaluate.statistics.intervals import Interval, bootstrap_interval
 
 @dataclass
 class Result:
-    """Result of one protocol with one agent.
+    """Result of one protocol with one agent."""
 
-    Attributes:
-        chosen: the protocol.
-        label: name of the agent.
-        about: origin of the agent, robot, seed and rates: plain data.
-        played: rows without repeats, curves, notes.
-        repeats: number of rows that repeated another one and do not count.
-        summary: figures with n and interval, by condition.
-        verdicts: of its claims.
-        seconds: what it took, s.
-    """
-
-    chosen: Chosen
-    label: str
-    about: dict[str, Any]
-    played: Played
-    repeats: int
-    summary: list[dict[str, Any]]
-    verdicts: list[Verdict]
-    seconds: float
+    chosen: Chosen  # the protocol
+    label: str  # name of the agent
+    about: dict[str, Any]  # origin of the agent, robot, seed and rates: plain data
+    played: Played  # rows without repeats, curves, notes
+    repeats: int  # number of rows that repeated another one and do not count
+    summary: list[dict[str, Any]]  # figures with n and interval, by condition
+    verdicts: list[Verdict]  # of its claims
+    seconds: float  # what it took, s
 
 
 def as_json(result: Result) -> dict[str, Any]:

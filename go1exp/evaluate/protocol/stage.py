@@ -27,19 +27,12 @@ from go1exp.sim.task import TaskConfig
 
 @dataclass(frozen=True)
 class Rates:
-    """Settings of the command line for all protocols.
+    """Settings of the command line for all protocols."""
 
-    Attributes:
-        seed: seed of everything random.
-        policy_dt: another period of the policy, s; None keeps that of training.
-        physics_dt: another physics step, s; None keeps that of training.
-        engine: physics engine; None takes MuJoCo on the CPU.
-    """
-
-    seed: int
-    policy_dt: float | None = None
-    physics_dt: float | None = None
-    engine: BackendConfig | None = None
+    seed: int  # seed of everything random
+    policy_dt: float | None = None  # another period of the policy, s; None keeps that of training
+    physics_dt: float | None = None  # another physics step, s; None keeps that of training
+    engine: BackendConfig | None = None  # physics engine; None takes MuJoCo on the CPU
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,27 +22,17 @@ AXES = {STEPS: "million environment steps", HOURS: "hours of training"}
 
 @dataclass(frozen=True)
 class Curve:
-    """One metric of one group over one axis.
-
-    Attributes:
-        metric: column of metrics.csv.
-        axis: steps or hours.
-        x: (T,), million steps or hours.
-        middle: interquartile mean over runs (T,).
-        low: lower bound of its 95 % interval (T,), NaN of one run.
-        high: upper bound (T,).
-        last: the last value of each run (runs,).
-    """
+    """One metric of one group over one axis."""
 
     group: str
-    metric: str
-    axis: str
-    x: Floats
-    middle: Floats
-    low: Floats
-    high: Floats
+    metric: str  # column of metrics.csv
+    axis: str  # steps or hours
+    x: Floats  # (T,), million steps or hours
+    middle: Floats  # interquartile mean over runs (T,)
+    low: Floats  # lower bound of its 95 % interval (T,), NaN of one run
+    high: Floats  # upper bound (T,)
     runs: int
-    last: Floats
+    last: Floats  # the last value of each run (runs,)
 
 
 @dataclass(frozen=True)

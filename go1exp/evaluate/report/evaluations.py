@@ -29,19 +29,12 @@ MAIN = ("error_xy", "error_yaw", FELL.name)
 
 @dataclass(frozen=True)
 class RunRows:
-    """The rows of one run.
+    """The rows of one run."""
 
-    Attributes:
-        table: columns (n,) by name.
-        settings: of the evaluation, plain data; only equal ones are compared.
-        keys: columns with the condition and the robot of a row.
-        protocol: None for the grid.
-    """
-
-    table: dict[str, NDArray[Any]]
-    settings: dict[str, Any]
-    keys: tuple[str, ...]
-    protocol: Protocol | None
+    table: dict[str, NDArray[Any]]  # columns (n,) by name
+    settings: dict[str, Any]  # of the evaluation, plain data; only equal ones are compared
+    keys: tuple[str, ...]  # columns with the condition and the robot of a row
+    protocol: Protocol | None  # None for the grid
 
     @property
     def sign(self) -> str:
@@ -51,20 +44,13 @@ class RunRows:
 
 @dataclass
 class Evaluation:
-    """One protocol, or the grid, of all runs that were evaluated with the same settings.
+    """One protocol, or the grid, of all runs that were evaluated with the same settings."""
 
-    Attributes:
-        name: grid, or the protocol's.
-        keys: columns with the condition of a row.
-        main: names of the compared quantities.
-        runs: rows by run folder.
-    """
-
-    name: str
-    keys: tuple[str, ...]
+    name: str  # grid, or the protocol's
+    keys: tuple[str, ...]  # columns with the condition of a row
     columns: tuple[Column, ...]
-    main: tuple[str, ...]
-    runs: dict[Path, RunRows] = field(default_factory=dict)
+    main: tuple[str, ...]  # names of the compared quantities
+    runs: dict[Path, RunRows] = field(default_factory=dict)  # rows by run folder
     settings: dict[str, Any] = field(default_factory=dict)
 
 

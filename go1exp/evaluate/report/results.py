@@ -42,65 +42,42 @@ Rows = Mapping[Path, NDArray[np.bool_]]
 
 @dataclass(frozen=True)
 class Figure:
-    """One quantity of one group.
-
-    Attributes:
-        runs: estimate with its interval over runs; n is the number of runs.
-        robots: of a share, Wilson's interval over all robots of these runs; else None.
-        bootstrap: of a share, the percentile interval over runs; else None.
-        values: of each run, NaN where undefined.
-        condition: empty for all conditions together.
-    """
+    """One quantity of one group."""
 
     group: str
     column: Column
-    runs: Interval
-    robots: Interval | None
-    bootstrap: Interval | None
-    values: Floats
-    condition: tuple[tuple[str, Any], ...] = ()
+    runs: Interval  # estimate with its interval over runs; n is the number of runs
+    robots: Interval | None  # of a share, Wilson's interval over all robots of these runs; else None
+    bootstrap: Interval | None  # of a share, the percentile interval over runs; else None
+    values: Floats  # of each run, NaN where undefined
+    condition: tuple[tuple[str, Any], ...] = ()  # empty for all conditions together
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """One quantity of one group compared with the baseline.
-
-    Attributes:
-        first: interquartile mean of the baseline.
-        other: interquartile mean of the group.
-        difference: with its p and effect sizes.
-        adjusted_p: after Holm's correction; the p itself without a correction.
-        word: better, worse or no significant difference.
-        needed: runs per group needed for 80 % power; None if significant, or without a difference.
-        hopeless: whether no difference could be significant with so few runs among so many comparisons.
-        robots: difference of these policies robot by robot; None where no two robots of a condition differ.
-    """
+    """One quantity of one group compared with the baseline."""
 
     group: str
     column: Column
-    first: float
-    other: float
-    difference: Difference
-    adjusted_p: float
-    word: Word
-    needed: int | None
-    hopeless: bool
+    first: float  # interquartile mean of the baseline
+    other: float  # interquartile mean of the group
+    difference: Difference  # with its p and effect sizes
+    adjusted_p: float  # after Holm's correction; the p itself without a correction
+    word: Word  # better, worse or no significant difference
+    needed: int | None  # runs per group needed for 80 % power; None if significant, or without a difference
+    hopeless: bool  # whether no difference could be significant with so few runs among so many comparisons
+    # difference of these policies robot by robot; None where no two robots of a condition differ
     robots: Interval | None
 
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """Correlation of one quantity with one result.
+    """Correlation of one quantity with one result."""
 
-    Attributes:
-        source: a swept setting (over runs), or a randomised quantity (over robots).
-        adjusted_p: after Holm's correction over the quantities of the same source and result.
-    """
-
-    source: Literal["setting", "drawn"]
+    source: Literal["setting", "drawn"]  # a swept setting (over runs), or a randomised quantity (over robots)
     column: Column
     association: Association
-    adjusted_p: float
+    adjusted_p: float  # after Holm's correction over the quantities of the same source and result
 
 
 # ---------------------------------------------------------------------- quantities
@@ -308,17 +285,13 @@ def _deviation(rows: RunRows, keys: Sequence[str], column: Column) -> Floats:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Results of one evaluation of all runs.
-
-    Attributes:
-        verdicts: comparisons with the baseline; none for a single group.
-        runs_required: least number of runs per group with which a difference can be significant; None for none.
-    """
+    """Results of one evaluation of all runs."""
 
     evaluation: Evaluation
     figures: list[Figure]
     by_condition: list[Figure]
-    verdicts: list[Verdict]
+    verdicts: list[Verdict]  # comparisons with the baseline; none for a single group
+    # least number of runs per group with which a difference can be significant; None for none
     runs_required: int | None
     sensitivities: list[Sensitivity]
 

@@ -38,22 +38,15 @@ COMPARABLE = {
 
 @dataclass(frozen=True)
 class Run:
-    """One training run.
-
-    Attributes:
-        label: unique name in reports.
-        state: done, running, stopped, failed, or not started.
-        cause: reason of a failure.
-        job: name in the sweep; empty without one.
-    """
+    """One training run."""
 
     folder: Path
-    label: str
+    label: str  # unique name in reports
     config: dict[str, Any]
     seed: int
-    state: str
-    cause: str = ""
-    job: str = ""
+    state: str  # done, running, stopped, failed, or not started
+    cause: str = ""  # reason of a failure
+    job: str = ""  # name in the sweep; empty without one
 
 
 @dataclass(frozen=True)
@@ -76,14 +69,10 @@ class Study:
 
 @dataclass
 class Group:
-    """Runs that differ in their seed alone.
-
-    Attributes:
-        settings: keys in which groups differ, with this group's values; "-" for a missing key.
-    """
+    """Runs that differ in their seed alone."""
 
     name: str
-    settings: dict[str, Any]
+    settings: dict[str, Any]  # keys in which groups differ, with this group's values; "-" for a missing key
     runs: list[Run]
 
 

@@ -19,18 +19,12 @@ LARGE = 500  # largest number of values with a permutation test; more are tested
 
 @dataclass(frozen=True)
 class Association:
-    """Correlation of one quantity with another.
-
-    Attributes:
-        spearman: rank correlation; NaN for categories.
-        p: of the correlation, two-sided, or of the variance between categories; by permutation.
-        importance: explained share of the variance; 0 or less is none.
-    """
+    """Correlation of one quantity with another."""
 
     name: str
-    spearman: float
-    p: float
-    importance: float
+    spearman: float  # rank correlation; NaN for categories
+    p: float  # of the correlation, two-sided, or of the variance between categories; by permutation
+    importance: float  # explained share of the variance; 0 or less is none
     n: int
 
 

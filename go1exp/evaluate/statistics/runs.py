@@ -143,22 +143,15 @@ ALPHA = 1.0 - LEVEL
 
 @dataclass(frozen=True)
 class Difference:
-    """Difference of a group from the baseline.
+    """Difference of a group from the baseline."""
 
-    Attributes:
-        estimate: interquartile mean of the group minus that of the baseline, with Yuen's interval; n is the number of
-            runs of the smaller group, or of pairs.
-        p: of the permutation test, two-sided.
-        effect: Hedges' g, in standard deviations.
-        improvement: probability that a run of the group has more than one of the baseline; ties count half.
-        least_p: the smallest p that so few runs can give.
-    """
-
+    # interquartile mean of the group minus that of the baseline, with Yuen's interval; n is the number of runs of the
+    # smaller group, or of pairs
     estimate: Interval
-    p: float
-    effect: float
-    improvement: float
-    least_p: float
+    p: float  # of the permutation test, two-sided
+    effect: float  # Hedges' g, in standard deviations
+    improvement: float  # probability that a run of the group has more than one of the baseline; ties count half
+    least_p: float  # the smallest p that so few runs can give
 
 
 def difference(group: ArrayLike, baseline: ArrayLike, paired: bool = False) -> Difference:

@@ -40,36 +40,23 @@ HELD_AT = 0.5
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion of one robot over a piece.
+    """Motion of one robot over a piece."""
 
-    Attributes:
-        name: measured, before, after, target.
-        q: (T, J) joint angles, rad.
-        base: (T, 7) position, m, and attitude w-x-y-z of the trunk; None holds it.
-    """
-
-    name: str
-    q: Array
-    base: Array | None = None
+    name: str  # measured, before, after, target
+    q: Array  # (T, J) joint angles, rad
+    base: Array | None = None  # (T, 7) position, m, and attitude w-x-y-z of the trunk; None holds it
 
 
 @dataclass(frozen=True)
 class Piece:
-    """A time span of a recording.
+    """A time span of a recording."""
 
-    Attributes:
-        title: its origin.
-        t: (T,) time in the episode, s.
-        motions: the first one is what was measured.
-        curves: quantity -> joint -> name of a motion -> (T,), in the quantity's unit.
-        noise: quantity -> joint -> standard deviation.
-    """
-
-    title: str
-    t: Array
-    motions: tuple[Motion, ...]
+    title: str  # its origin
+    t: Array  # (T,) time in the episode, s
+    motions: tuple[Motion, ...]  # the first one is what was measured
+    # quantity -> joint -> name of a motion -> (T,), in the quantity's unit
     curves: Mapping[str, Mapping[str, Mapping[str, Array]]]
-    noise: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    noise: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # quantity -> joint -> standard deviation
 
     @property
     def duration(self) -> float:
@@ -92,13 +79,9 @@ class Piece:
 
 @dataclass(frozen=True)
 class Story:
-    """A replay: one or more pieces.
+    """A replay: one or more pieces."""
 
-    Attributes:
-        kind: of a log, or of a result of ``go1exp gap``.
-    """
-
-    kind: Literal["log", "gap"]
+    kind: Literal["log", "gap"]  # of a log, or of a result of ``go1exp gap``
     about: str
     pieces: tuple[Piece, ...]
 
@@ -272,34 +255,23 @@ APART = 0.9
 
 @dataclass(frozen=True)
 class Ghost:
-    """A robot drawn in addition to the model's own.
-
-    Attributes:
-        shift: (3,) displacement, m.
-    """
+    """A robot drawn in addition to the model's own."""
 
     name: str
     qpos: Array
-    shift: Array
+    shift: Array  # (3,) displacement, m
 
 
 @dataclass(frozen=True)
 class ReplayView:
-    """Content of the panels beside the story, which they have themselves: it is long, and this is sent often.
-
-    Attributes:
-        time: s from its beginning.
-        speed: s of the recording per s.
-        magnify: factor by which errors are magnified.
-        ghosts: robots drawn in addition to the model's own, which is the first motion shown.
-    """
+    """Content of the panels beside the story, which they have themselves: it is long, and this is sent often."""
 
     number: int
-    time: float
+    time: float  # s from its beginning
     running: bool
-    speed: float
-    magnify: float
-    ghosts: tuple[Ghost, ...]
+    speed: float  # s of the recording per s
+    magnify: float  # factor by which errors are magnified
+    ghosts: tuple[Ghost, ...]  # robots drawn in addition to the model's own, which is the first motion shown
 
 
 class ReplayShow:

@@ -35,15 +35,10 @@ class Command:
 
 @dataclass(frozen=True)
 class Push:
-    """Push the trunk once: a half sine over ``session.PUSH_S``.
+    """Push the trunk once: a half sine over ``session.PUSH_S``."""
 
-    Attributes:
-        impulse: N s.
-        direction: of the force, from the robot's heading counter-clockwise, rad.
-    """
-
-    impulse: float
-    direction: float
+    impulse: float  # N s
+    direction: float  # of the force, from the robot's heading counter-clockwise, rad
 
 
 @dataclass(frozen=True)
@@ -55,56 +50,36 @@ class SelectPolicy:
 
 @dataclass(frozen=True)
 class SetEffects:
-    """Set the active effects.
+    """Set the active effects."""
 
-    Attributes:
-        sizes: by name; 1 is the effect as its choice or the run has it, 0 its absence.
-    """
-
-    sizes: dict[str, float]
+    sizes: dict[str, float]  # by name; 1 is the effect as its choice or the run has it, 0 its absence
 
 
 @dataclass(frozen=True)
 class SelectGround:
-    """Restart on another ground.
-
-    Attributes:
-        level: difficulty: the row of graded tiles, or a lane's difficulty in its own unit.
-        tile: kind of tile, of graded tiles.
-    """
+    """Restart on another ground."""
 
     ground: str
-    level: float = 0.0
-    tile: str | None = None
+    level: float = 0.0  # difficulty: the row of graded tiles, or a lane's difficulty in its own unit
+    tile: str | None = None  # kind of tile, of graded tiles
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """Set sensors, delay and physics step.
+    """Set sensors, delay and physics step."""
 
-    Attributes:
-        noise: add sensor noise to the observations.
-        delay: additional command delay, s.
-        physics_dt: physics step, s; None takes that of training.
-        trunk_velocity: the true one, or that of the Kalman filter.
-    """
-
-    noise: bool = False
-    delay: float = 0.0
-    physics_dt: float | None = None
-    trunk_velocity: Literal["exact", "estimated"] = "exact"
+    noise: bool = False  # add sensor noise to the observations
+    delay: float = 0.0  # additional command delay, s
+    physics_dt: float | None = None  # physics step, s; None takes that of training
+    trunk_velocity: Literal["exact", "estimated"] = "exact"  # the true one, or that of the Kalman filter
 
 
 @dataclass(frozen=True)
 class Pace:
-    """Set the speed of the simulation.
-
-    Attributes:
-        speed: simulated seconds per second.
-    """
+    """Set the speed of the simulation."""
 
     paused: bool
-    speed: float = 1.0
+    speed: float = 1.0  # simulated seconds per second
 
 
 @dataclass(frozen=True)
@@ -224,19 +199,13 @@ FOREVER = 1e7
 
 @dataclass(frozen=True)
 class Ground:
-    """A selectable ground.
+    """A selectable ground."""
 
-    Attributes:
-        config: graded tiles or a plane; None for a lane.
-        unit: of a level; empty for rows of tiles.
-        tiles: kinds of tile.
-    """
-
-    config: TerrainConfig | None
+    config: TerrainConfig | None  # graded tiles or a plane; None for a lane
     lane: GroundName | None = None
     hardest: float = 0.0
-    unit: str = ""
-    tiles: tuple[str, ...] = ()
+    unit: str = ""  # of a level; empty for rows of tiles
+    tiles: tuple[str, ...] = ()  # kinds of tile
 
     def built(self, level: float) -> TerrainConfig:
         """Return the terrain at a level."""

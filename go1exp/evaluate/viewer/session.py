@@ -92,30 +92,20 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Robots:
-    """Selectable policies, grounds and effects.
+    """Selectable policies, grounds and effects."""
 
-    Attributes:
-        agents: label -> loader of the policy, bundle or controller.
-    """
-
-    agents: Mapping[str, Callable[[], Agent]]
+    agents: Mapping[str, Callable[[], Agent]]  # label -> loader of the policy, bundle or controller
     grounds: Mapping[str, Ground]
     effects: Mapping[str, Term]
 
 
 @dataclass(frozen=True)
 class PushMade:
-    """A push, for its arrow.
+    """A push, for its arrow."""
 
-    Attributes:
-        time: at which it began, s.
-        impulse: N s.
-        angle: of the force in the world, rad.
-    """
-
-    time: float
-    impulse: float
-    angle: float
+    time: float  # at which it began, s
+    impulse: float  # N s
+    angle: float  # of the force in the world, rad
 
 
 class Session:

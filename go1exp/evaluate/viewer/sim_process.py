@@ -54,39 +54,26 @@ ENDS_S = 5.0
 
 @dataclass(frozen=True)
 class Frame:
-    """State of the robot, and everything that has happened since the frame before.
+    """State of the robot, and everything that has happened since the frame before."""
 
-    Attributes:
-        now: s on the clock of ``time.perf_counter``.
-        clock: of the robot, s.
-        qpos: (19,) position, attitude and joint angles.
-        first: number of the first row, counted since the start of the robot.
-        rows: (R, 29) in the columns above, ``ROW_S`` apart.
-        packets: (P, 3) of the client's packets: arrival, s; time since the packet before, s, NaN for a client's first
-            one; time between new commands, s, NaN for a packet that repeats the one before.
-        peer: address of the client; None before the first packet.
-        connected: whether a packet of the client has arrived in the last second.
-        slipped: time by which the robot's clock is behind real time, s.
-        push: the last one, by the robot's clock.
-        sizes: of the active effects, by name.
-    """
-
-    now: float
-    clock: float
-    qpos: Array
-    first: int
-    rows: NDArray[np.float32]
+    now: float  # s on the clock of ``time.perf_counter``
+    clock: float  # of the robot, s
+    qpos: Array  # (19,) position, attitude and joint angles
+    first: int  # number of the first row, counted since the start of the robot
+    rows: NDArray[np.float32]  # (R, 29) in the columns above, ``ROW_S`` apart
+    # (P, 3) of the client's packets: arrival, s; time since the packet before, s, NaN for a client's first one; time
+    # between new commands, s, NaN for a packet that repeats the one before
     packets: Array
-    peer: str | None
-    connected: bool
+    peer: str | None  # address of the client; None before the first packet
+    connected: bool  # whether a packet of the client has arrived in the last second
     states: int
     lost: int
     refused: dict[str, int]
-    slipped: float
+    slipped: float  # time by which the robot's clock is behind real time, s
     posture: str
-    push: PushMade
+    push: PushMade  # the last one, by the robot's clock
     message: str
-    sizes: dict[str, float]
+    sizes: dict[str, float]  # of the active effects, by name
 
 
 class Probe:

@@ -56,44 +56,27 @@ MOST_POINTS = 1000
 
 @dataclass(frozen=True)
 class Intervals:
-    """Times between packets of the last ``history.SPAN`` s.
+    """Times between packets of the last ``history.SPAN`` s."""
 
-    Attributes:
-        t: times of arrival, 0 for now, s; thinned out.
-        interval: time since the packet before, ms; of each group the longest.
-        p50: median of all intervals, ms; NaN without any.
-        p99: ms.
-        worst: ms.
-    """
-
-    t: list[float]
-    interval: list[float]
-    p50: float
-    p99: float
-    worst: float
+    t: list[float]  # times of arrival, 0 for now, s; thinned out
+    interval: list[float]  # time since the packet before, ms; of each group the longest
+    p50: float  # median of all intervals, ms; NaN without any
+    p99: float  # ms
+    worst: float  # ms
 
 
 @dataclass(frozen=True)
 class SimView(Timed):
-    """Content of the panels.
+    """Content of the panels."""
 
-    Attributes:
-        frame: the newest one.
-        velocity: true forward, left, m/s, and yaw rate, rad/s, in the trunk's frame.
-        every: intervals of all packets of the client.
-        new: intervals of packets that differ from the one before: the cycles of a client that repeats each command.
-        rate: packets received in the last second.
-        answers: states sent per second.
-        known: description of each known effect, by name.
-    """
-
-    frame: Frame
-    velocity: Series
-    every: Intervals
+    frame: Frame  # the newest one
+    velocity: Series  # true forward, left, m/s, and yaw rate, rad/s, in the trunk's frame
+    every: Intervals  # intervals of all packets of the client
+    # intervals of packets that differ from the one before: the cycles of a client that repeats each command
     new: Intervals
-    rate: int
-    answers: float
-    known: dict[str, str]
+    rate: int  # packets received in the last second
+    answers: float  # states sent per second
+    known: dict[str, str]  # description of each known effect, by name
 
 
 class SimShow:

@@ -42,49 +42,28 @@ class Arrow:
 
 @dataclass(frozen=True)
 class Timed:
-    """Curves of the last seconds that all windows show.
+    """Curves of the last seconds that all windows show."""
 
-    Attributes:
-        t: times of the curves, 0 for now, s.
-        height: of the trunk over the ground, m; NaN for a suspended robot.
-        torque: twelve, over the limit.
-        contacts: contact intervals of each leg, s.
-        pushes: times of pushes, s.
-    """
-
-    t: list[float]
-    height: list[float]
-    torque: Series
-    contacts: tuple[tuple[tuple[float, float], ...], ...]
-    pushes: list[float]
+    t: list[float]  # times of the curves, 0 for now, s
+    height: list[float]  # of the trunk over the ground, m; NaN for a suspended robot
+    torque: Series  # twelve, over the limit
+    contacts: tuple[tuple[tuple[float, float], ...], ...]  # contact intervals of each leg, s
+    pushes: list[float]  # times of pushes, s
     arrows: tuple[Arrow, ...]
 
 
 @dataclass(frozen=True)
 class Reward:
-    """A reward term of the last second.
+    """A reward term of the last second."""
 
-    Attributes:
-        name: its key.
-        mean: per second, weight included.
-        curve: its last ``history.SPAN`` s, thinned out.
-    """
-
-    name: str
-    mean: float
-    curve: list[float]
+    name: str  # its key
+    mean: float  # per second, weight included
+    curve: list[float]  # its last ``history.SPAN`` s, thinned out
 
 
 @dataclass(frozen=True)
 class WalkView(Timed):
-    """Content of the panels.
-
-    Attributes:
-        achieved: simulated seconds per second.
-        time: simulated s.
-        physics_dt: step in force, s.
-        total: of all rewards, per second.
-    """
+    """Content of the panels."""
 
     label: str
     labels: tuple[str, ...]
@@ -94,16 +73,16 @@ class WalkView(Timed):
     command: ask.Velocity
     limits: tuple[tuple[float, float], ...]
     pace: ask.Pace
-    achieved: float
-    time: float
+    achieved: float  # simulated seconds per second
+    time: float  # simulated s
     falls: int
     message: str
-    physics_dt: float
+    physics_dt: float  # step in force, s
     command_curves: Series
     true: Series
     estimated: Series
     rewards: tuple[Reward, ...]
-    total: float
+    total: float  # of all rewards, per second
 
 
 class WalkShow:
