@@ -33,8 +33,7 @@ HELP = """usage: go1exp VERB [key=value ...]
   eval "$(go1exp -sc install=bash)"      tab completion
 """
 
-HELP_WORDS = ("-h", "--help", "help")
-"""Ask for help; a verb may come after."""
+HELP_WORDS = ("-h", "--help", "help")  # ask for help; a verb may come after
 
 
 def main() -> int:

@@ -201,8 +201,7 @@ def discard(run: Path, of_lock: Sequence[str] = ()) -> None:
 
 _bars: list[Any] = []
 
-LINE_PERIOD = 5.0
-"""Least time between two lines of progress when there is no terminal, s."""
+LINE_PERIOD = 5.0  # least time between two lines of progress when there is no terminal, s
 
 
 def announce(what: str) -> None:

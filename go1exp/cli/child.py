@@ -15,8 +15,7 @@ from pathlib import Path
 from go1exp.cli import main
 from go1exp.train import run_state
 
-PR_SET_PDEATHSIG = 1
-"""``prctl(2)``: the signal to get when the parent dies."""
+PR_SET_PDEATHSIG = 1  # ``prctl(2)``: the signal to get when the parent dies
 
 PATIENCE_S = 60.0
 """Time for which an older process of the same job may save its checkpoint; then the lock belongs to another, s."""

@@ -101,8 +101,7 @@ class EvalSettings:
             raise ValueError(f"settle_s = {self.settle_s}: must be shorter than duration_s = {self.duration_s}")
 
 
-RATES = "rate"
-"""Kind of protocol that only policies can play."""
+RATES = "rate"  # kind of protocol that only policies can play
 
 GRID_ONLY = (
     *("grid", "episodes", "duration_s", "settle_s", "noise", "randomize", "push", "train_ground", "trunk_velocity"),

@@ -80,8 +80,7 @@ def _export(container: dict[str, Any]) -> None:
 APP = App("export", _export, ExportSettings)
 
 
-WIDTH = 120
-"""Of the table where there is no terminal, characters."""
+WIDTH = 120  # of the table where there is no terminal, characters
 
 
 def _check(container: dict[str, Any]) -> None:

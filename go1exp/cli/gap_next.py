@@ -75,8 +75,7 @@ class GapLoopSettings(RecordingConfig):
             raise ValueError("\n".join(wrong))
 
 
-TARGETS, ANSWER = "next.csv", "next.json"
-"""Names of the files in the output folder."""
+TARGETS, ANSWER = "next.csv", "next.json"  # names of the files in the output folder
 
 
 def _next(container: dict[str, Any]) -> int:
@@ -172,8 +171,7 @@ def _attitude(attitude: Any) -> str:
 NEXT = App("gap_next", _next, GapNextSettings)
 
 
-TABLE = "loop.json"
-"""Name of the file with a row for each round."""
+TABLE = "loop.json"  # name of the file with a row for each round
 
 
 def _loop(container: dict[str, Any]) -> int:

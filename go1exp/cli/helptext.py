@@ -22,8 +22,7 @@ from go1exp.config.schema import plugins, registry
 from go1exp.config.schema import settings as schema
 from go1exp.config.schema.registry import ConfigError, members, nearest, unknown_name
 
-KEY_WIDTH = 34
-"""Columns of ``key=value`` before the text beside it."""
+KEY_WIDTH = 34  # columns of ``key=value`` before the text beside it
 
 WITHOUT = {"experiment": "", "study": "", "terrain": "; without it flat, or that of training with train_ground=true"}
 """Group without a default choice -> remark in its line; all others then keep the choice of training."""

@@ -70,8 +70,7 @@ def checkpoint_file(run: Path, name: str | None) -> Path | None:
     return file
 
 
-FEWEST_ROWS = 4
-"""Rows that a window must have."""
+FEWEST_ROWS = 4  # rows that a window must have
 
 
 def files_of(places: str | Sequence[str]) -> list[Path]:

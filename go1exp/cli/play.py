@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from go1exp.train.policy import Policy
 
 
-FORMATS = (".mp4", ".gif")
-"""Endings of a clip's file; the picture beside it is a .png."""
+FORMATS = (".mp4", ".gif")  # endings of a clip's file; the picture beside it is a .png
 
 
 def _task(container: dict[str, Any]) -> None:

@@ -86,8 +86,7 @@ class PlaySettings:
 RUNS, MOST_RUNS = Path("runs"), 12
 """Where runs are looked for, and how many of the newest are offered."""
 
-GIVEN = "given"
-"""Name of a ground that is none of ``conf/terrain``."""
+GIVEN = "given"  # name of a ground that is none of ``conf/terrain``
 
 
 def address(host: str, port: int) -> tuple[str, int]:
@@ -284,7 +283,6 @@ def _sim(container: dict[str, Any]) -> int:
     return 0
 
 
-HERE = ("127.0.0.1", 8007)
-"""Default address; it cannot be reached from the network."""
+HERE = ("127.0.0.1", 8007)  # default address; it cannot be reached from the network
 
 SIM = App("sim", _sim, SimSettings)

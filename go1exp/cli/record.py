@@ -107,8 +107,7 @@ CONTACT = "contact"
 POLICY, MPC = "policy", "mpc"
 """The excitations that are a trained policy, and a model predictive controller, walking."""
 
-COMMANDS = "gentle"
-"""Random commands (``conf/command``) that a model predictive controller walks under."""
+COMMANDS = "gentle"  # random commands (``conf/command``) that a model predictive controller walks under
 
 
 def rig_groups(container: Mapping[str, Any]) -> tuple[str, ...]:

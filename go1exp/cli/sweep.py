@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from go1exp.train.sweep.command import Launcher, Task
     from go1exp.train.sweep.index import Index
 
-LOG = "job.log"
-"""In the run folder of a job that ran in a process of its own: what it printed."""
+LOG = "job.log"  # in the run folder of a job that ran in a process of its own: what it printed
 
 
 @dataclass(frozen=True)

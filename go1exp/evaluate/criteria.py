@@ -98,8 +98,7 @@ CRITERIA = (
 )
 """Chosen limits: m, m/s, rad/s, Hz, cycles, body weights, shares; of means over the robots of a command."""
 
-LEAST_DELAY_MS = 30
-"""Further command delay at which no robot may fall, ms."""
+LEAST_DELAY_MS = 30  # further command delay at which no robot may fall, ms
 
 
 @dataclass(frozen=True)

@@ -25,9 +25,7 @@ FIRST_RGB, SECOND_RGB = (90, 170, 255), (255, 176, 70)
 
 COLOURS = {"FR": FIRST_RGB, "RL": FIRST_RGB, "FL": SECOND_RGB, "RR": SECOND_RGB}
 GROUND_RGB, ROW_RGB, LINE_RGB = (28, 30, 34), (44, 47, 53), (88, 92, 100)
-
-ROW_SHARE = 0.022
-"""Height of a row over the height of the picture."""
+ROW_SHARE = 0.022  # height of a row over the height of the picture
 
 
 @cache

@@ -50,8 +50,7 @@ class Column:
 FELL = Column("fell", "", "robots that fell", "share", "lower")
 LEFT = Column("left_map", "", "robots that left the map, which is not surviving", "share", "lower")
 MOVING = Column("moving_s", "s", "time under a command until a fall")
-LIFE = (FELL, LEFT, MOVING)
-"""Of every protocol; falls per moving robot-minute come from the first and the last."""
+LIFE = (FELL, LEFT, MOVING)  # of every protocol; falls per moving robot-minute come from the first and the last
 
 
 @dataclass(frozen=True)
@@ -204,8 +203,7 @@ def _named(interval: Interval, name: str) -> dict[str, Any]:
     return {name: figure["estimate"], "low": figure["low"], "high": figure["high"], "n": figure["n"]}
 
 
-DRAW = "draw."
-"""First part of the name of a column with something that was drawn for the robot."""
+DRAW = "draw."  # first part of the name of a column with something that was drawn for the robot
 
 ERRORS = (
     Column("error_xy", "m/s", "root mean square error of the horizontal velocity", better="lower"),
@@ -297,8 +295,7 @@ def _columns(name: str, values: NDArray[np.float64]) -> dict[str, NDArray[np.flo
 
 # ---------------------------------------------------------------------- files
 
-FILE = "eval.json"
-"""In a run folder; the rows are beside it."""
+FILE = "eval.json"  # in a run folder; the rows are beside it
 
 
 def rows_file(report: Path) -> Path:

@@ -20,11 +20,8 @@ Columns = dict[str, tuple[str, Show]]
 """Header -> measure and its format."""
 
 NO_FIGURE = "-"
-
 FEET = "FR FL RR RL"
-
-WIDTH = 120
-"""Largest width of a table of further measures, in characters."""
+WIDTH = 120  # largest width of a table of further measures, in characters
 
 
 def _numbers(form: str, factor: float = 1.0) -> Show:

@@ -21,8 +21,7 @@ from go1exp.logs.record.simulate import sample
 from go1exp.robot.messages import LowCmd
 from go1exp.sim.env.core import Go1Core
 
-VELOCITY_NOISE = 0.02
-"""Half-width of the noise of the paper's Table II on the trunk's exact velocity, m/s."""
+VELOCITY_NOISE = 0.02  # half-width of the noise of the paper's Table II on the trunk's exact velocity, m/s
 
 
 class Driven:

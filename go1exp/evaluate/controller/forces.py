@@ -73,8 +73,7 @@ class Structure:
     sense: np.ndarray  # (7 n,) the solver's kinds of bounds: all may be active
 
 
-MOST_STRUCTURES = 500
-"""Largest number of cached structures; a gait repeats some tens of schedules."""
+MOST_STRUCTURES = 500  # largest number of cached structures; a gait repeats some tens of schedules
 
 
 class ForcePlan:

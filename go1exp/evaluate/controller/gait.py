@@ -9,14 +9,7 @@ from go1exp.evaluate.controller.settings import SwingSettings
 
 
 class Clock:
-    """The clock of a gait.
-
-    A leg stands in the first ``duty`` of its cycle and swings in the rest.
-
-    Attributes:
-        duty: that share.
-        period: of a cycle, s.
-    """
+    """The clock of a gait: a leg stands in the first ``duty`` of each cycle of ``period`` s, and swings in the rest."""
 
     def __init__(self, offsets: tuple[float, ...], duty: float, period: float) -> None:
         """Start at phase 0; ``offsets`` (4,) are the legs' phases then, in cycles; ``duty`` in (0, 1)."""

@@ -40,13 +40,10 @@ BUILT = ("settings", "period", "_kin", "_plan", "_every")
 
 
 class Mpc:
-    """Model predictive controller of one robot.
+    """Model predictive controller of one robot, called every ``period`` s.
 
     Its world frame has z up and x at zero heading of the IMU. Positions in it are the integrated velocity: only
     differences within a stride matter, so drift does not.
-
-    Attributes:
-        period: time between two calls, s.
     """
 
     def __init__(self, settings: MpcSettings, inertia: str = "merged") -> None:

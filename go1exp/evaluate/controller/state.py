@@ -47,13 +47,7 @@ def roll_pitch_yaw(rotation: np.ndarray) -> tuple[float, float, float]:
 
 
 class Smoothed:
-    """Complementary filters of attitude, joint angles and velocity.
-
-    Attributes:
-        quat: (4,) w-x-y-z.
-        joint_pos: (12,) rad.
-        velocity_b: (3,) m/s.
-    """
+    """Complementary filters of ``quat`` (4,) w-x-y-z, ``joint_pos`` (12,), rad, and ``velocity_b`` (3,), m/s."""
 
     def __init__(self, settings: SmoothingSettings, dt: float) -> None:
         """Smooth readings with a period of ``dt`` s."""
@@ -92,12 +86,7 @@ def _turned(quat: np.ndarray, by: np.ndarray) -> np.ndarray:
 
 
 class Ground:
-    """Slope of the ground and height of the trunk above it, both smoothed.
-
-    Attributes:
-        gradient: (2,) rise of the ground per m along x and y of the world.
-        height: of the trunk's origin, vertically above the ground, m.
-    """
+    """Smoothed ``gradient`` (2,) of the ground along the world's x and y, and ``height`` of the trunk above it, m."""
 
     def __init__(self, settings: StanceSettings, height_time: float, dt: float) -> None:
         """Smooth the height with time constant ``height_time`` s; called every ``dt`` s."""

@@ -30,11 +30,7 @@ class Sensed:
 
 
 class Controller(Protocol):
-    """Controls one robot, called once every ``period``.
-
-    Attributes:
-        period: time between two calls, s.
-    """
+    """Controls one robot, called once every ``period`` s."""
 
     period: float
 
@@ -61,9 +57,6 @@ class AsTargets:
 
     With the actuator's gains kp and kd, the target is q + (torque + kd qd) / kp. Between two ticks the actuator's gains
     act, not the controller's. Recordings of such a walk are complete: the targets determine the motion.
-
-    Attributes:
-        period: time between two calls, s.
     """
 
     def __init__(self, inner: Controller, kp: np.ndarray, kd: np.ndarray) -> None:

@@ -192,8 +192,7 @@ def lives(motion: Motion) -> list[Row]:
 
 # ---------------------------------------------------------------------- from a configuration
 
-GRID = "grid"
-"""The protocol that is the grid of ``go1exp eval`` itself and has no keys here."""
+GRID = "grid"  # the protocol that is the grid of ``go1exp eval`` itself and has no keys here
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,7 @@ from go1exp.evaluate.statistics.intervals import (
 )
 from go1exp.evaluate.statistics.runs import Word, verdict_by_interval
 
-DRAWS = 200
-"""Bootstrap samples of the difference of a figure of all robots."""
+DRAWS = 200  # bootstrap samples of the difference of a figure of all robots
 
 
 @dataclass(frozen=True)
@@ -102,8 +101,7 @@ def _of_all(subject: str, a: Derived, b: Derived, first: Sequence[Row], other: S
     return Difference(subject, a.name, a.unit, dict(a.condition), *pair, between, verdict, needed)
 
 
-POWER = (1.96 + 0.842) / 1.96
-"""Ratio of a difference to the half-width of its interval at 80 % power."""
+POWER = (1.96 + 0.842) / 1.96  # ratio of a difference to the half-width of its interval at 80 % power
 
 
 def as_json(difference: Difference) -> dict[str, Any]:

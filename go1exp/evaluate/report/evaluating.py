@@ -20,8 +20,7 @@ from go1exp.evaluate.report.study import Run
 from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
 from go1exp.train.policy import load_run
 
-BEST = "best.pt"
-"""The checkpoint that evaluation during training found best, in a run folder."""
+BEST = "best.pt"  # the checkpoint that evaluation during training found best, in a run folder
 
 
 Progress = Callable[[int, int], None]

@@ -20,8 +20,7 @@ from go1exp.evaluate.report.study import Run, Study
 from go1exp.mdp.measures import every_measure
 
 GRID = "grid"
-PROTOCOLS = "protocols"
-"""Folder of other protocols in a run folder."""
+PROTOCOLS = "protocols"  # folder of other protocols in a run folder
 
 MAIN = ("error_xy", "error_yaw", FELL.name)
 """Quantities of the grid that are compared by default: few, as each one raises the corrected p-values."""

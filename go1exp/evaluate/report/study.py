@@ -16,8 +16,7 @@ from go1exp.base.wording import counted
 from go1exp.config.schema.registry import ConfigError
 from go1exp.train import run_state
 
-SWEEP = "sweep.json"
-"""Index of a sweep, in its folder; any folder of runs will do without it."""
+SWEEP = "sweep.json"  # index of a sweep, in its folder; any folder of runs will do without it
 
 WITHOUT = (
     *("seed", "resume", "logger", "checkpoint", "torch_threads", "device", "devices", "plugins", "eval", "video"),
@@ -25,8 +24,7 @@ WITHOUT = (
 )
 """Keys that change what a run saves or where it runs, and not what is learnt; and paths."""
 
-LONGEST = 70
-"""Letters of a name made of keys; the name of the sweep's job, or a number, replaces a longer one."""
+LONGEST = 70  # letters of a name made of keys; the name of the sweep's job, or a number, replaces a longer one
 
 COMPARABLE = {
     "reward": "returns are of different rewards",

@@ -132,8 +132,7 @@ Direction = Literal["lower", "higher"]
 
 ORDER: tuple[Word, ...] = ("better", "worse", "no significant difference")
 
-RESAMPLES = 20_000
-"""Permutations of a test; where there are fewer, all of them."""
+RESAMPLES = 20_000  # permutations of a test; where there are fewer, all of them
 
 LEAST_RANDOM_P = 2.0 / (RESAMPLES + 1)
 """Smallest two-sided p of random permutations, which include the observed one."""
@@ -314,8 +313,7 @@ def verdict_by_p(estimate: float, p: float, better: Direction) -> Word:
     return "better" if (estimate > 0.0) == (better == "higher") else "worse"
 
 
-FEWEST_PAIRS = 3
-"""Pairs from which a difference may be significant: the spread of two is hardly known."""
+FEWEST_PAIRS = 3  # pairs from which a difference may be significant: the spread of two is hardly known
 
 
 def verdict_by_interval(between: Interval, better: Direction) -> Word:

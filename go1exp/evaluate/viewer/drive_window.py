@@ -51,11 +51,7 @@ HELP = ("arrows: forward, back, yaw", "comma, full stop: left, right", "0 zero, 
 
 
 class DriveWindow(Window):
-    """Panels of a simulation.
-
-    Attributes:
-        places: where controls are on the page, left, top, right, bottom, pixels.
-    """
+    """Panels of a simulation; ``places`` of controls on the page are left, top, right, bottom, pixels."""
 
     def __init__(self, pad: Gamepad) -> None:
         super().__init__("Robot", "Curves")

@@ -20,8 +20,7 @@ from typing import Any
 
 from go1exp.base.errors import Expected
 
-FIRST_PORT, PORTS = 8080, 20
-"""First port and number of ports of the search for a free one."""
+FIRST_PORT, PORTS = 8080, 20  # first port and number of ports of the search for a free one
 
 REFUSAL = "go1exp: open the address that the command printed; without the token in it nothing is shown\n"
 
@@ -117,20 +116,17 @@ def instructions(host: str, port: int, token: str) -> str:
     return "\n".join([*lines, "Ctrl-C ends it"])
 
 
-PATH = "/gamepad"
-"""Path to which the script sends."""
+PATH = "/gamepad"  # path to which the script sends
 
 AXES = (1, 0, 2)
 """Axis of each part of the command in the standard mapping: left stick up and left, right stick left are -1."""
 
-DEAD = 0.15
-"""Dead zone of a stick: worn sticks do not return to their centre."""
+DEAD = 0.15  # dead zone of a stick: worn sticks do not return to their centre
 
 SILENT_S = 1.0
 """Time without a message after which a held stick counts as released, s. The script sends twice as often."""
 
-STAND, PUSH = 0, 1
-"""Buttons of the standard mapping: the lower one and the right one of the four."""
+STAND, PUSH = 0, 1  # buttons of the standard mapping: the lower one and the right one of the four
 
 SCRIPT = f"""<script>
 (() => {{

@@ -24,18 +24,14 @@ Array = NDArray[np.float64]
 
 UNITS = {"q": "rad", "qd": "rad/s", "q_target": "rad", "tau_est": "N m", "tau_cmd": "N m"}
 
-STEP_S = 0.02
-"""Real time between two frames, s."""
-
+STEP_S = 0.02  # real time between two frames, s
 SLOWEST = 0.05  # s of the recording per s
 
 SHOWN_ERROR = 0.15
 """Largest error of an angle as it is shown at first, rad: smaller ones are magnified to that, up to ``MOST``."""
 
 MOST = 50.0  # largest magnification
-
-HELD_AT = 0.5
-"""Height of a trunk that is held, or of which nothing is known, m."""
+HELD_AT = 0.5  # height of a trunk that is held, or of which nothing is known, m
 
 
 @dataclass(frozen=True)
@@ -168,8 +164,7 @@ class Player:
         return q, None if motion.base is None else motion.base[self.row]
 
 
-MODELS = ("before", "after")
-"""Names of the models' motions."""
+MODELS = ("before", "after")  # names of the models' motions
 
 
 def magnification(pieces: Sequence[Piece]) -> float:

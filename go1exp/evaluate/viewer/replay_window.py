@@ -36,8 +36,7 @@ SPEEDS = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0)
 
 NAMES = {"q": "angle", "qd": "velocity", "tau_est": "torque, reported", "tau_cmd": "torque, commanded"}
 
-HEIGHT = 165.0
-"""Of a plot, pixels."""
+HEIGHT = 165.0  # of a plot, pixels
 
 NOW = imgui.Vec4(1.0, 1.0, 1.0, 0.6)
 

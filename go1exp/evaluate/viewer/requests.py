@@ -99,8 +99,7 @@ class Ended(Exception):
 Request = Command | Push | SelectPolicy | SetEffects | SelectGround | Conditions | Pace | Step | Reset
 
 
-LARGEST = 3.0
-"""Largest size of an effect, relative to its choice."""
+LARGEST = 3.0  # largest size of an effect, relative to its choice
 
 
 def catalogue(effects: tuple[Term, ...], randomize: bool) -> tuple[dict[str, Term], dict[str, float]]:
@@ -192,9 +191,7 @@ HARDEST: dict[GroundName, float] = {
 """Largest difficulty of each lane, in the unit of ``protocol.ground.UNITS`` (chosen: beyond all shipped policies)."""
 
 FLAT = "flat"
-
-FOREVER = 1e7
-"""Time limit of an episode, s."""
+FOREVER = 1e7  # time limit of an episode, s
 
 
 @dataclass(frozen=True)

@@ -27,17 +27,11 @@ from go1exp.sim.task import TaskConfig
 
 Array = NDArray[np.float64]
 
-SPAN = 10.0
-"""Duration of a curve, s."""
+SPAN = 10.0  # duration of a curve, s
 
 
 class History:
-    """A ring of rows, one for each period of the policy.
-
-    Attributes:
-        widths: columns by the name of a quantity.
-        dt: time from row to row, s.
-    """
+    """A ring of rows ``dt`` s apart, one for each period of the policy; ``widths`` are columns by quantity."""
 
     def __init__(self, widths: Mapping[str, int], dt: float) -> None:
         """Keep the last ``SPAN`` s."""
@@ -109,16 +103,9 @@ class PushMade:
 
 
 class Session:
-    """One simulated robot.
+    """One simulated robot that the policy ``label`` drives, at ``speed`` simulated s per s, since ``time`` simulated s.
 
-    A request (``ask``) is checked before anything changes: an invalid one is rejected in ``message``.
-
-    Attributes:
-        robots: what can be selected.
-        label: of the present policy.
-        speed: simulated seconds per second.
-        time: simulated seconds since the session began.
-        message: for the user, a line; empty for none.
+    A request (``ask``) is checked before anything changes: an invalid one is rejected in ``message``, one line.
     """
 
     def __init__(self, robots: Robots, label: str, setup: Setup, velocity: requests.Velocity) -> None:

@@ -48,8 +48,7 @@ SWITCH_S = 1e-4
 Built = tuple[Robot, dict[str, float]] | str
 """A robot with the sizes of its effects, or the reason why it cannot be built."""
 
-ENDS_S = 5.0
-"""Time that the robot's process is given to end, s."""
+ENDS_S = 5.0  # time that the robot's process is given to end, s
 
 
 @dataclass(frozen=True)
@@ -215,11 +214,7 @@ class Refused:
 
 
 class RobotProcess:
-    """A robot in another process.
-
-    Attributes:
-        address: where it listens for its client, host and port.
-    """
+    """A robot in another process, which listens for its client at ``address``, host and port."""
 
     def __init__(
         self,

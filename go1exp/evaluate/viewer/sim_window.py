@@ -42,16 +42,14 @@ from go1exp.sim.env.camera import Stage
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.terrain import build_terrain
 
-LOOK_S = 1.0 / 30.0
-"""Period at which the robot is looked at, s."""
+LOOK_S = 1.0 / 30.0  # period at which the robot is looked at, s
 
 Array = NDArray[np.float64]
 
 WIDTHS = {"height": 1, "velocity": 3, "torque": 12, "contact": 4}
 """Columns of the curves."""
 
-MOST_POINTS = 1000
-"""Most intervals that are drawn: of a faster client the longest of each group."""
+MOST_POINTS = 1000  # most intervals that are drawn: of a faster client the longest of each group
 
 
 @dataclass(frozen=True)
@@ -206,11 +204,7 @@ BEHIND_S = 0.001  # time behind real time from which the panel reports it, s
 
 
 class SimWindow(Window):
-    """Panels of a robot that an external client commands.
-
-    Attributes:
-        places: where controls are on the page, left, top, right, bottom, pixels.
-    """
+    """Panels of a robot that an external client commands; ``places`` as of ``DriveWindow``."""
 
     def __init__(self) -> None:
         super().__init__("Robot", "Curves")

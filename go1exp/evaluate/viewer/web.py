@@ -32,11 +32,7 @@ LONGER, SHORTER = 1.3, 0.95  # factors of the frame period with and without lost
 
 
 class PictureRate:
-    """Frame period that grows while the simulation loses time, and slowly shrinks again.
-
-    Attributes:
-        every: frame period, s.
-    """
+    """Frame period ``every``, s, that grows while the simulation loses time, and slowly shrinks again."""
 
     def __init__(self, now: float) -> None:
         """Start at the time ``now``, s, with the shortest frame period."""

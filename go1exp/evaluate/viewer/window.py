@@ -25,19 +25,13 @@ from go1exp.sim.env.camera import AZIMUTH, DISTANCE, ELEVATION
 LEFT, RIGHT = 0.23, 0.42
 """Width of the panels: the left one's share of the window, and the right one's of what is left."""
 
-ARROW_WIDTH = 0.013
-"""m."""
+ARROW_WIDTH = 0.013  # m
 
 Vec2 = imgui.Vec2
 
 
 class Window(plugin.ViewerPlugin):
-    """Base of the windows.
-
-    Attributes:
-        view: what is to be drawn; None before the first one.
-        follow: whether the camera goes with the robot.
-    """
+    """Base of the windows: draws ``view``, None before the first one; the camera goes with the robot to ``follow``."""
 
     def __init__(self, *panels: str) -> None:
         """Dock two panels of these names at the left and at the right."""
@@ -158,8 +152,7 @@ def paragraph(text: str, lines: int = 0) -> None:
         imgui.TextUnformatted(line)
 
 
-MESSAGE_LINES = 2
-"""Lines reserved for the message to the user."""
+MESSAGE_LINES = 2  # lines reserved for the message to the user
 
 
 def section(label: str, is_open: bool = True) -> bool:
@@ -169,11 +162,7 @@ def section(label: str, is_open: bool = True) -> bool:
 
 
 class PushPanel:
-    """Impulse, direction and button of a push.
-
-    Attributes:
-        places: where its button is on the page, left, top, right, bottom, pixels.
-    """
+    """Impulse, direction and button of a push; ``places`` has the button's left, top, right, bottom, pixels."""
 
     def __init__(self, send: Callable[[ask.Push], None]) -> None:
         self._send, self._impulse, self._direction = send, 20.0, 90.0

@@ -20,8 +20,7 @@ from go1exp.evaluate.quantities import Column, Row
 from go1exp.mdp.measures.gait import touchdown_phase
 from go1exp.mdp.measures.trace import find_runs
 
-SHOWN = 1.5
-"""Time of the gait diagram, s."""
+SHOWN = 1.5  # time of the gait diagram, s
 
 
 @protocol("gait")

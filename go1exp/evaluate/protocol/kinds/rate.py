@@ -21,8 +21,7 @@ from go1exp.evaluate.quantities import Column, Derived, Row, values
 if TYPE_CHECKING:
     from go1exp.evaluate.protocol.stage import Stage
 
-LATEST_MS = 60.0
-"""Upper bound of the effect ``command_delay``, ms."""
+LATEST_MS = 60.0  # upper bound of the effect ``command_delay``, ms
 
 
 @protocol("rate")

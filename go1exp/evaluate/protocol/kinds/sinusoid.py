@@ -21,9 +21,7 @@ if TYPE_CHECKING:
     from go1exp.evaluate.protocol.stage import Stage
 
 AXES = ("x", "y", "yaw")
-
-EVERY = 4
-"""Of so many steps one is kept for drawings."""
+EVERY = 4  # of so many steps one is kept for drawings
 
 
 def _columns() -> tuple[Column, ...]:

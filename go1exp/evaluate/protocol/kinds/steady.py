@@ -105,8 +105,7 @@ def command_text(condition: Mapping[str, Any]) -> str:
     return ", ".join(f"{axis} {condition[axis]:g}" for axis in AXES if condition[axis]) or "stand"
 
 
-RISEN = 0.9
-"""Share of the steady-state velocity at which a step has risen."""
+RISEN = 0.9  # share of the steady-state velocity at which a step has risen
 
 
 @protocol("corners")
