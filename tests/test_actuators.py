@@ -53,14 +53,6 @@ def test_the_most_that_a_hip_can_do_at_a_speed(speed: float, most: float, drives
         np.testing.assert_allclose(tau[0], sign * np.tile([most, most, 1.5 * most], 4), atol=1e-9)
 
 
-def test_a_stronger_line_has_a_corner(drives: Drives) -> None:
-    drive = motor(drives(1), kp=1000.0, kd=0.0, stall=30.0, speed=30.0)
-    for speed, most in [(0.0, 23.7), (6.3, 23.7), (10.0, 20.0), (30.0, 0.0)]:  # corner at 30 (1 - 23.7 / 30)
-        tau = drive.torque(rows(9.0), rows(0.0), rows(speed))[0]
-        assert tau[:2].tolist() == pytest.approx([most, most])
-        assert tau[2] == pytest.approx(30.0 * (1.0 - speed / 30.0))  # the line lies below the calf's 35.55
-
-
 def test_a_motor_at_a_voltage_is_its_circuit(drives: Drives) -> None:
     """The current of U = R i + L di/dt + k qd, integrated until it rests, times k; then the limit of the current."""
 
@@ -112,14 +104,6 @@ def test_a_dc_motor_is_pd_within_its_line(drives: Drives) -> None:
         for j in range(12):
             expected = slow(target[i, j], q[i, j], qd[i, j], j, [20.0, 25.0, 30.0][j % 3], 0.6)
             assert got[i, j].item() == pytest.approx(expected, abs=1e-12), (i, j)
-
-
-def test_a_motor_without_numbers_has_the_robots(drives: Drives) -> None:
-    drive = motor(drives(1), kp=1000.0)
-    still = drive.torque(rows(9.0), rows(0.0), rows(0.0))[0]
-    assert still.tolist() == pytest.approx(EFFORT.tolist())
-    fast = drive.torque(rows(9.0), rows(0.0), rows([30.1, 30.1, 20.06] * 4))[0]
-    assert fast.tolist() == pytest.approx([0.0] * 12, abs=1e-9)
 
 
 # ---------------------------------------------------------------------- delay
@@ -194,16 +178,6 @@ def test_effects_on_gains_reach_the_drive_inside(inner: str, drives: Drives) -> 
     EffectStack(terms, setup).set_gains(late, late.kp.clone(), late.kd.clone())
     tau = late.torque(setup.zeros() + 0.1, setup.zeros(), setup.zeros() + 1.0)
     assert tau.flatten().tolist() == pytest.approx([10.0 * 0.1 - 1.0 * 1.0] * 24)
-
-
-def test_effects_on_gains_act_through_a_delay_in_the_environment(start_core: Callable[..., Go1Core]) -> None:
-    kp: list[Tensor] = []
-    for drive in ("pd", "delay"):
-        core = start_core(f"actuator={drive}", "effect=[kp_scale]")
-        inside: Any = getattr(core.plant.actuator, "drive", core.plant.actuator)
-        kp.append(inside.kp)
-    assert torch.equal(*kp)
-    assert (kp[0] != 20.0).all()
 
 
 # ---------------------------------------------------------------------- net: the form of the file
@@ -452,43 +426,6 @@ def test_a_net_stepped_faster_than_it_was_recorded_is_another_drive_unless_its_p
     trapped = played(Net(setup, file=str(by_taps)), series)
     np.testing.assert_allclose(trapped, law(1), atol=1e-5)
     assert np.abs(trapped - resampled).max() > 1.0
-
-
-def overshoot(drive: Callable[[float, float, float], float], dt: float) -> float:
-    """Of a joint of 0.03 kg m2 on a step of 0.2 rad from rest, as a share of the step; ``drive(target, q, qd)``."""
-    q = qd = highest = 0.0
-    drive(0.0, q, qd)
-    for _ in range(round(0.5 / dt)):
-        tau = drive(0.2, q, qd)
-        for _ in range(10):
-            qd += tau / 0.03 * dt / 10
-            q += qd * dt / 10
-        highest = max(highest, q)
-    return highest / 0.2 - 1.0
-
-
-def test_counting_samples_hides_most_of_the_overshoot_of_the_recorded_drive(
-    tmp_path: Path, make_net: Callable[..., Path], drives: Drives
-) -> None:
-    like, dt = load(make_net()), 0.005
-
-    def net(spacing: float, period: str) -> float:
-        path = firmware_at_20ms(tmp_path / "net.npz", like, spacing)
-        made = Net(drives(1, physics_dt=dt), file=str(path), period=period)  # type: ignore[arg-type]
-        return overshoot(lambda *inputs: made.torque(*map(rows, inputs))[0, 0].item(), dt)
-
-    def law(lag: int) -> float:
-        errors: list[float] = []
-
-        def drive(target: float, q: float, qd: float) -> float:
-            errors.append(target - q)
-            return float(np.clip(20.0 * errors[max(0, len(errors) - 1 - lag)] - 0.5 * qd, -23.7, 23.7))
-
-        return overshoot(drive, dt)
-
-    assert net(0.02, "resample") == pytest.approx(law(4), abs=1e-4)
-    assert net(0.005, "exact") == pytest.approx(law(1), abs=1e-4)
-    assert net(0.02, "hold") > net(0.02, "resample") > 1.5 * net(0.005, "exact")
 
 
 # ---------------------------------------------------------------------- net: refusals

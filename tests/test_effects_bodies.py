@@ -230,18 +230,6 @@ def test_a_payload_taken_away_undoes_one_and_leaves_an_inertia() -> None:
     assert engine(rig(corner, held=None)).env_model(0).body_inertia[1].min() > 0.09 * plain.body_inertia[1].min()
 
 
-def test_a_shifted_calf_hangs_lower_by_the_torque_of_its_weight() -> None:
-    """Static: kp x (change of angle) = weight x shift x sin(pitch of the calf), thigh and calf alike."""
-    shift, kp = 0.02, 400.0
-    a, b = (settle(rig({"link_com": {"along": {"calf": s}}}, kp=kp, kd=4.0)) for s in (0.0, shift))
-    q = robot.NOMINAL_STANCE
-    mass = rig({}).backend.model.body("FR_calf").mass[0]
-    lever = shift * np.sin(q[THIGHS] + q[CALVES]) * np.cos(q[HIPS])
-    for joint in (THIGHS, CALVES):
-        assert np.allclose(kp * (b - a)[0, joint].numpy(), -mass * G * lever, atol=2e-3, rtol=0.05)
-    assert np.abs(lever).min() > 0.005
-
-
 # ---------------------------------------------------------------------- gravity, forces, IMU
 
 
@@ -473,21 +461,6 @@ def test_a_spring_twists_by_compliance_times_torque_and_the_drive_reads_the_roto
     assert torch.allclose(seen, q + compliance * plant.torque, atol=1e-7)
     assert torch.allclose(plant.torque, 35.0 * (torch.as_tensor(robot.NOMINAL_STANCE) - seen), atol=1e-7)
     assert plant.torque.abs().max() > 0.5
-
-
-@pytest.mark.slow("go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
-def test_free_play_between_upright_and_upside_down_is_the_gap() -> None:
-    gap, upside_down = 0.02, (0.0, 1.0, 0.0, 0.0)
-    q = {
-        (b, held): settle(rig({"backlash": {"gap": b}}, held=held, kp=400.0, kd=2.0), seconds=2.0)
-        for b in (0.0, gap)
-        for held in (LEVEL, upside_down)
-    }
-    rigid = q[0.0, LEVEL] - q[0.0, upside_down]
-    loose = q[gap, LEVEL] - q[gap, upside_down]
-    play = (loose - rigid) * rigid.sign()
-    assert torch.allclose(play[:, THIGHS], torch.full_like(play[:, THIGHS], gap), rtol=0.05)
-    assert torch.allclose(play[:, CALVES], torch.full_like(play[:, CALVES], gap), rtol=0.05)
 
 
 def test_flexibility_and_backlash_are_in_series() -> None:
