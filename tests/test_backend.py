@@ -93,19 +93,6 @@ def test_a_batch_is_a_serial_loop_over_its_own_models_bit_for_bit(make_backend: 
     assert touched
 
 
-def test_contact_forces_after_a_reset_are_those_of_the_new_state(make_backend: Build) -> None:
-    backend = make_backend(2)
-    block = backend.sensors.foot_contact
-    for height, touching in [(0.30, True), (0.6, False)]:
-        qpos, qvel = initial(2, height)
-        qpos[:, 3:7], qpos[:, 7:] = torch.tensor([1.0, 0, 0, 0]), torch.as_tensor(robot.NOMINAL_STANCE)
-        backend.reset(everyone(2), qpos, 0 * qvel)
-        count = backend.sensordata[:, block].reshape(2, 4, 4)[..., 0]
-        force = backend.sensordata[:, block].reshape(2, 4, 4)[..., 1:]
-        assert ((count > 0) == touching).all()
-        assert ((force.norm(dim=-1) > 1.0) == touching).all()
-
-
 def test_the_step_tensors_stay_the_same_objects_in_memory(make_backend: Build) -> None:
     backend = make_backend(2)
     addresses = [x.data_ptr() for x in (backend.qpos, backend.qvel, backend.sensordata, backend.field("body_mass"))]
@@ -237,34 +224,6 @@ def test_the_snapshot_names_the_parts_that_touch_and_a_foot_is_no_calf(start_cor
     assert alone.sum() > 5
     assert (s.calf_contact & ~s.foot_contact).sum() > 5
     assert members("termination")["trunk_contact"].target(s).sum() > 5
-
-
-@pytest.mark.parametrize(
-    ("joints", "height", "turn", "touching"),
-    [
-        # Belly on the ground, legs straight up beside it.
-        ([0.0, 3.14, -0.9], 0.056, None, {"trunk"}),
-        # Nominal stance, all feet in the ground by 5 mm or more.
-        (list(robot.NOMINAL_STANCE), 0.31, None, {"foot"}),
-        # Kneeling: thighs forward and down, shanks folded up behind the knee; the shank's own end is the lowest point.
-        ([0.0, -0.6, -2.8], 0.1872, None, {"calf"}),
-        # On the back, legs up.
-        (list(robot.NOMINAL_STANCE), 0.055, [np.pi, 0.0, 0.0], {"trunk"}),
-    ],
-    ids=["belly", "feet", "knees", "back"],
-)
-def test_a_known_posture_touches_with_the_right_part(
-    start_core: Callable[..., Go1Core], joints: list[float], height: float, turn: list[float] | None, touching: set[str]
-) -> None:
-    core = start_core("sim.policy_dt=0.002", "rand=none", "event=none", "termination=none", num_envs=1, noise=False)
-    quat = Rotation.from_rotvec(turn or [0.0, 0.0, 0.0]).as_quat(scalar_first=True)
-    qpos = torch.as_tensor(np.concatenate([[0.0, 0.0, height], quat, np.tile(joints, 12 // len(joints))]))
-    core.backend.reset(everyone(1), qpos.unsqueeze(0), torch.zeros(1, 18, dtype=torch.float64))
-    core.step(torch.zeros(1, 12))
-    s = core.snapshot()
-    flags = {"foot": s.foot_contact, "thigh": s.thigh_contact, "calf": s.calf_contact, "trunk": s.trunk_contact}
-    for part, flag in flags.items():
-        assert flag.all() if part in touching else not flag.any(), part
 
 
 def test_a_fault_is_seen_and_not_healed(make_backend: Build, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

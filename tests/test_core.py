@@ -102,11 +102,13 @@ def test_a_restart_of_nobody_can_be_left_out(make_core: Make) -> None:
 
 
 @GROUNDS
-def test_the_same_seed_gives_the_same_trajectory_and_another_seed_another(
+def test_a_seed_gives_one_trajectory_whatever_the_number_of_threads_and_another_seed_another(
     make_core: Make, ground: tuple[str, ...]
 ) -> None:
     inputs = actions(4, 40)
-    first, second, other = (make_core(*LIVELY, *ground, num_envs=4, seed=s) for s in (1, 1, 2))
+    first, second, other = (
+        make_core(*LIVELY, *ground, f"backend.threads={t}", num_envs=4, seed=s) for s, t in ((1, 1), (1, 2), (2, 1))
+    )
     start, again, elsewhere = first.reset(), second.reset(), other.reset()
     assert torch.equal(start, again)
     assert not torch.equal(start, elsewhere)
@@ -114,15 +116,6 @@ def test_the_same_seed_gives_the_same_trajectory_and_another_seed_another(
     for a, b, c in zip(run(first, inputs), run(second, inputs), run(other, inputs), strict=True):
         assert same(a, b)
         assert (a["observation"] != c["observation"]).any(1).all()
-
-
-@GROUNDS
-def test_the_number_of_threads_changes_no_bit(make_core: Make, ground: tuple[str, ...]) -> None:
-    inputs = actions(5, 40)
-    one, two = (make_core(*LIVELY, *ground, f"backend.threads={t}", num_envs=5) for t in (1, 2))
-    assert torch.equal(one.reset(), two.reset())
-    for a, b in zip(run(one, inputs), run(two, inputs), strict=True):
-        assert same(a, b)
 
 
 @GROUNDS
@@ -452,15 +445,6 @@ def test_the_snapshot_describes_the_state(start_core: Make) -> None:
             assert value.shape[0] == 5, f.name
             assert value.dtype in (torch.float32, torch.bool), f.name
         np.testing.assert_allclose(s.base_pos_w, core.backend.qpos[:, :3], atol=1e-6)
-        for i in range(5):
-            want = expected_observation(core, i, action)
-            for got, part in [
-                (s.base_lin_vel_b, slice(0, 3)),
-                (s.base_ang_vel_b, slice(3, 6)),
-                (s.projected_gravity_b, slice(6, 9)),
-                (s.joint_vel, slice(24, 36)),
-            ]:
-                np.testing.assert_allclose(got[i], want[part], atol=5e-6)
         np.testing.assert_allclose(s.episode_time, 0.02 * k, rtol=1e-6)
 
 
@@ -634,12 +618,9 @@ def test_a_robot_that_leaves_the_map_is_truncated_and_brought_back(start_core: M
     assert not result.terminated.any()
     assert torch.equal(core.backend.qpos[:4, :3], spawn[:4])
     np.testing.assert_allclose(core.backend.qpos[4:, :2], places[4:], atol=0.01)
-
-
-def test_flat_ground_has_no_edge(start_core: Make) -> None:
-    core = start_core(*QUIET, num_envs=2)
-    core.backend.qpos[:, 0] = 1e4
-    assert not core.step(torch.zeros(2, 12)).truncated.any()
+    flat = start_core(*QUIET, num_envs=2)  # which has no edge
+    flat.backend.qpos[:, 0] = 1e4
+    assert not flat.step(torch.zeros(2, 12)).truncated.any()
 
 
 def test_robots_start_in_the_middle_of_their_tile_column_by_column(start_core: Make) -> None:

@@ -846,20 +846,8 @@ def test_the_light_way_stops_at_a_signal_and_loads_nothing_heavy(bundle: str, tm
         "with open('modules.json', 'w') as file:\n"
         "    json.dump(sorted({name.split('.')[0] for name in sys.modules}), file)\nsys.exit(status)"
     )
-    arguments = [
-        bundle,
-        "--command",
-        "0.2,0,0",
-        "--stand-up",
-        "0.2",
-        "--brake",
-        "0.2",
-        "--stale",
-        str(BUSY),
-        "--out",
-        "logs",
-    ]
-    process, pipe = begun(tmp_path, "-c", code, *arguments)
+    arguments = f"--command 0.2,0,0 --stand-up 0.2 --brake 0.2 --stale {BUSY} --out logs".split()
+    process, pipe = begun(tmp_path, "-c", code, bundle, *arguments)
     lines = []
     for line in pipe:
         lines.append(line)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from go1exp.config.compose import compose
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.faults import NumericalFault
 from go1exp.sim.env.sb3_env import Go1VecEnv
-from go1exp.sim.task import TrainConfig, parse_train
+from go1exp.sim.task import parse_train
 from go1exp.train import checkpoint
 from go1exp.train.device import DevicePPO
 from go1exp.train.device_update import DeviceUpdate
@@ -28,41 +27,18 @@ SMALL = (
 )
 
 
-@pytest.fixture
-def config() -> TrainConfig:
-    return parse_train(compose("train", SMALL))
-
-
-@pytest.fixture
-def learner(config: TrainConfig) -> Callable[..., Any]:
+def learner(kind: type[AdaptivePPO] = DevicePPO, *overrides: str) -> Any:
     """Build a learner of a class on a new environment, all on the CPU: the law is that of the GPU."""
-
-    def make(kind: type[AdaptivePPO] = DevicePPO) -> Any:
-        core = Go1Core(config.task, config.ppo.num_envs, 0, spread_starts=True)
-        return kind(config.ppo, Go1VecEnv(core), 0, "cpu")
-
-    return make
-
-
-def test_advantages_and_returns_are_those_of_sb3(learner: Callable[..., DevicePPO]) -> None:
-    ppo = learner()
-    ppo.learn(48)
-    ours = ppo.rollout_buffer
-    theirs = RolloutBuffer(6, ppo.observation_space, ppo.action_space, "cpu", ours.gae_lambda, ours.gamma, 8)
-    d = ours.data
-    assert d["starts"].any()
-    for k in range(6):
-        arrays = [d[name][k].numpy() for name in ("observations", "actions", "rewards", "starts")]
-        observation, action, reward, start = arrays
-        theirs.add(observation, action, reward, start, d["values"][k], d["log_probs"][k])
-    last, ended = torch.randn(8), torch.rand(8) < 0.5
-    theirs.compute_returns_and_advantage(last, ended.numpy())
-    ours.estimate(last, ended)
-    np.testing.assert_allclose(d["advantages"].numpy(), theirs.advantages, rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(d["returns"].numpy(), theirs.returns, rtol=1e-6, atol=1e-6)
+    config = parse_train(compose("train", (*SMALL, *overrides)))
+    core = Go1Core(config.task, config.ppo.num_envs, 0, spread_starts=True)
+    ppo: Any = kind(config.ppo, Go1VecEnv(core), 0, "cpu")
+    ppo.log = []
+    ppo.after_iteration = lambda p: p.log.append(dict(p.logger.name_to_value))
+    torch.manual_seed(1)
+    return ppo
 
 
-def test_advantages_and_returns_on_the_cpu_are_those_of_sb3(learner: Callable[..., AdaptivePPO]) -> None:
+def test_advantages_and_returns_on_the_cpu_are_those_of_sb3() -> None:
     ppo = learner(AdaptivePPO)
     env = ppo.get_env()
     assert env is not None
@@ -80,7 +56,7 @@ def test_advantages_and_returns_on_the_cpu_are_those_of_sb3(learner: Callable[..
     np.testing.assert_allclose(returns, ours.returns, rtol=1e-6, atol=1e-6)
 
 
-def test_a_rollout_holds_what_sb3s_own_loop_collects(learner: Callable[..., Any]) -> None:
+def test_a_rollout_holds_what_sb3s_own_loop_collects() -> None:
     """Same seed, same first rollout: observations, actions, rewards with the value beyond a time limit, episodes."""
     mine, theirs = learner(), learner(AdaptivePPO)
     for ppo in (mine, theirs):
@@ -88,6 +64,7 @@ def test_a_rollout_holds_what_sb3s_own_loop_collects(learner: Callable[..., Any]
         torch.manual_seed(1)
         ppo.learn(48)
     data = mine.rollout_buffer.data
+    assert data["starts"][1:].any()
     for name in ("observations", "actions", "rewards", "values", "log_probs", "advantages", "returns", "means"):
         wanted = getattr(theirs.rollout_buffer, name)
         np.testing.assert_allclose(data[name].numpy(), wanted, rtol=1e-5, atol=1e-5, err_msg=name)
@@ -97,7 +74,7 @@ def test_a_rollout_holds_what_sb3s_own_loop_collects(learner: Callable[..., Any]
     np.testing.assert_array_equal(mine._last_obs, theirs._last_obs)
 
 
-def test_minibatches_hold_every_sample_once(learner: Callable[..., DevicePPO]) -> None:
+def test_minibatches_hold_every_sample_once() -> None:
     ppo = learner()
     ppo.learn(48)
     wanted = ppo.rollout_buffer.data["log_probs"].flatten().sort().values
@@ -147,29 +124,22 @@ class Sb3UpdateOnDevice(DevicePPO):
     ],
 )
 def test_an_update_is_sb3s(ours: type[AdaptivePPO], sb3s: type[AdaptivePPO], overrides: tuple[str, ...]) -> None:
-    config = parse_train(compose("train", (*SMALL, "ppo.epochs=3", "ppo.init_std=0.5", *overrides)))
-    found: list[tuple[dict[str, torch.Tensor], list[dict[str, float]]]] = []
+    pair = []
     for kind in (ours, sb3s):
-        core = Go1Core(config.task, config.ppo.num_envs, 0, spread_starts=True)
-        ppo: Any = kind(config.ppo, Go1VecEnv(core), 0, "cpu")
-        logs: list[dict[str, float]] = []
-        ppo.after_iteration = lambda p, logs=logs: logs.append(dict(p.logger.name_to_value))
-        torch.manual_seed(1)
-        ppo.learn(48 * 4)
-        found.append((ppo.policy.state_dict(), logs))
-    (mine, my_logs), (theirs, their_logs) = found
-    assert len(my_logs) == len(their_logs) == 4
-    for name, value in theirs.items():
-        torch.testing.assert_close(mine[name], value, rtol=1e-3, atol=1e-5, msg=name)
-    for one, other in zip(my_logs, their_logs, strict=True):
+        pair.append(learner(kind, "ppo.epochs=3", "ppo.init_std=0.5", *overrides))
+        pair[-1].learn(48 * 4)
+    mine, theirs = pair
+    assert len(mine.log) == len(theirs.log) == 4
+    for name, value in theirs.policy.state_dict().items():
+        torch.testing.assert_close(mine.policy.state_dict()[name], value, rtol=1e-3, atol=1e-5, msg=name)
+    for one, other in zip(mine.log, theirs.log, strict=True):
         assert {k for k in one if k.startswith("train/")} == {k for k in other if k.startswith("train/")}
         for key in one:
-            of_images = config.ppo.symmetry and key in ("train/clip_fraction", "train/approx_kl")  # in SB3's
+            of_images = mine.config.symmetry and key in ("train/clip_fraction", "train/approx_kl")  # in SB3's
             if key.startswith("train/") and not of_images:
                 assert one[key] == pytest.approx(other[key], rel=2e-3, abs=2e-5), key
-    rates = [log["train/learning_rate"] for log in my_logs]
-    if config.ppo.schedule == "adaptive":
-        assert len(set(rates)) > 1
+    if mine.config.schedule == "adaptive":
+        assert len({log["train/learning_rate"] for log in mine.log}) > 1
 
 
 @pytest.mark.parametrize("kind", [DevicePPO, AdaptivePPO])
@@ -178,23 +148,13 @@ def test_an_update_ends_before_the_step_at_which_the_policy_has_diverged_too_far
     kind: type[AdaptivePPO], schedule: str
 ) -> None:
     overrides = ("ppo.epochs=5", "ppo.init_std=0.5", f"ppo.schedule={schedule}", "ppo.learning_rate=0.0002")
-
-    def learner(*others: str) -> Any:
-        config = parse_train(compose("train", (*SMALL, *overrides, *others)))
-        core = Go1Core(config.task, config.ppo.num_envs, 0, spread_starts=True)
-        ppo: Any = kind(config.ppo, Go1VecEnv(core), 0, "cpu")
-        ppo.log = []
-        ppo.after_iteration = lambda p: p.log.append(dict(p.logger.name_to_value))
-        torch.manual_seed(1)
-        return ppo
-
-    limited = learner("ppo.max_kl=0.001")
+    limited = learner(kind, *overrides, "ppo.max_kl=0.001")
     limited.learn(48)
     steps = int(limited.log[0]["train/gradient_steps"])
     assert 2 <= steps < 5 * 4 - 1  # of five epochs of four minibatches
     assert limited.log[0]["train/kl"] <= 0.001
 
-    stopped = learner()
+    stopped = learner(kind, *overrides)
     adam, taken = stopped.policy.optimizer, [0]
     step = adam.step
 
@@ -212,7 +172,7 @@ def test_an_update_ends_before_the_step_at_which_the_policy_has_diverged_too_far
         mine, its = limited.policy.optimizer.state[parameter], adam.state[other]
         assert all(torch.equal(mine[key], its[key]) for key in ("step", "exp_avg", "exp_avg_sq"))
 
-    strict = learner("ppo.max_kl=1e-12")
+    strict = learner(kind, *overrides, "ppo.max_kl=1e-12")
     strict.learn(48)
     assert strict.log[0]["train/gradient_steps"] == 1
 
@@ -221,7 +181,7 @@ def test_an_update_ends_before_the_step_at_which_the_policy_has_diverged_too_far
     assert len(set(limited._kl)) > 1
 
 
-def test_training_stopped_and_resumed_is_training_in_one_go(learner: Callable[..., DevicePPO], tmp_path: Path) -> None:
+def test_training_stopped_and_resumed_is_training_in_one_go(tmp_path: Path) -> None:
     straight = learner()
     straight.learn(48 * 4)
     first = learner()
@@ -236,7 +196,7 @@ def test_training_stopped_and_resumed_is_training_in_one_go(learner: Callable[..
         assert torch.equal(a, b), name
 
 
-def test_a_checkpoint_goes_from_one_learner_to_the_other(learner: Callable[..., Any], tmp_path: Path) -> None:
+def test_a_checkpoint_goes_from_one_learner_to_the_other(tmp_path: Path) -> None:
     first, second = learner(), learner(AdaptivePPO)
     first.learn(48)
     checkpoint.save(first, tmp_path, keep=1)
@@ -246,7 +206,7 @@ def test_a_checkpoint_goes_from_one_learner_to_the_other(learner: Callable[..., 
     assert second.num_timesteps == 96
 
 
-def test_a_gradient_that_is_not_finite_stops_training(learner: Callable[..., DevicePPO]) -> None:
+def test_a_gradient_that_is_not_finite_stops_training() -> None:
     ppo = learner()
     ppo.learn(48)
     weight = ppo.policy.action_net.weight
@@ -256,7 +216,7 @@ def test_a_gradient_that_is_not_finite_stops_training(learner: Callable[..., Dev
         ppo.learn(48, reset_num_timesteps=False)
 
 
-def test_a_fault_in_the_environment_is_found_after_the_rollout_with_its_moment(learner: Callable[..., Any]) -> None:
+def test_a_fault_in_the_environment_is_found_after_the_rollout_with_its_moment() -> None:
     ppo = learner()
     core = ppo.get_env().core
     core._deferred = True  # as on a GPU

@@ -144,26 +144,6 @@ def test_torch_onnx_and_the_environment_agree(choice: str, make_task: Callable[.
             assert (given["joint_pos"] - core.snapshot().joint_pos).abs().max() > 1e-3
 
 
-def test_a_bundle_holds_the_policy_of_its_run(run: Path, good: Bundle) -> None:
-    """Through the file: the network that evaluation loads, on observations that nobody recorded."""
-    policy, _ = load_policy(run, parse_train(run_folder.read_config(run)).ppo)
-    given = {p.name: np.random.default_rng(1).normal(size=(50, p.size)).astype(np.float32) for p in good.policy.inputs}
-    given["imu_quat"] /= np.linalg.norm(given["imu_quat"], axis=1, keepdims=True)
-    out = good.policy(given)
-    gravity = Rotation.from_quat(given["imu_quat"], scalar_first=True).inv().apply([0.0, 0.0, -1.0])
-    observed = np.concatenate(
-        [
-            *(given["base_lin_vel_b"], given["imu_gyro"], gravity, given["command"]),
-            *(given["joint_pos"] - robot.NOMINAL_STANCE, given["joint_vel"], given["previous_action"]),
-        ],
-        axis=1,
-    )
-    np.testing.assert_allclose(out["observation"], observed, rtol=0, atol=1e-5)
-    action = policy(torch.as_tensor(observed, dtype=torch.float32)).numpy()
-    np.testing.assert_allclose(out["action"], action, rtol=0, atol=1e-5)
-    np.testing.assert_allclose(out["joint_target"], robot.NOMINAL_STANCE + 0.3 * action, rtol=0, atol=1e-5)
-
-
 def test_the_trace_is_the_environments(run: Path, good: Bundle) -> None:
     """Played again from outside, with evaluation's policy and the environment's own observations."""
     config = parse_train(run_folder.read_config(run))
@@ -511,16 +491,6 @@ def test_a_wrong_reading_is_named(reading: np.ndarray | None, message: str, good
     given["joint_pos"] = reading
     with pytest.raises(ValueError, match=message):
         good.policy(given)
-
-
-def test_a_row_is_the_same_alone_and_among_others(good: Bundle) -> None:
-    rng = np.random.default_rng(2)
-    given = {p.name: rng.normal(size=(5, p.size)).astype(np.float32) for p in good.policy.inputs}
-    together = good.policy(given)
-    for k in range(5):
-        alone = good.policy({name: values[k : k + 1] for name, values in given.items()})
-        for name, values in alone.items():
-            np.testing.assert_allclose(values[0], together[name][k], rtol=0, atol=1e-5)
 
 
 def test_the_runtime_does_on_the_traces_readings_what_the_environment_did(good: Bundle) -> None:

@@ -236,42 +236,6 @@ def test_timers_agree_with_a_count_of_the_whole_history(seed: int) -> None:
                 assert got == pytest.approx(want, abs=1e-6), (k, env, foot)
 
 
-def test_a_hop_by_hand() -> None:
-    """On the ground for 3 steps, in the air for 5, on the ground for 2, then off again."""
-    timers = Feet(1, 0.1, torch.device("cpu"))
-    history = []
-    for touching in [1, 1, 1, 0, 0, 0, 0, 0, 1, 1, 0]:
-        timers.begin_step()
-        timers.touch(torch.full((1, 4), bool(touching)))
-        history.append([getattr(timers, name)[0, 0].item() for name in Feet.timers])
-    by_hand = [  # air, contact, last air, last contact, touchdown
-        [0.0, 0.1, 0.0, 0.0, 0],
-        [0.0, 0.2, 0.0, 0.0, 0],
-        [0.0, 0.3, 0.0, 0.0, 0],
-        [0.1, 0.0, 0.0, 0.4, 0],
-        [0.2, 0.0, 0.0, 0.4, 0],
-        [0.3, 0.0, 0.0, 0.4, 0],
-        [0.4, 0.0, 0.0, 0.4, 0],
-        [0.5, 0.0, 0.0, 0.4, 0],
-        [0.0, 0.1, 0.6, 0.4, 1],
-        [0.0, 0.2, 0.6, 0.4, 0],
-        [0.1, 0.0, 0.6, 0.3, 0],
-    ]
-    np.testing.assert_allclose(history, by_hand, atol=1e-6)
-
-
-def test_a_touchdown_is_remembered_for_the_rest_of_the_policy_step() -> None:
-    timers = Feet(1, DT, torch.device("cpu"))
-    timers.begin_step()
-    seen = []
-    for touching in [False, True, False, False]:
-        timers.touch(torch.full((1, 4), touching))
-        seen.append(timers.touchdown.all().item())
-    assert seen == [False, True, True, True]
-    timers.begin_step()
-    assert not timers.touchdown.any()
-
-
 def test_a_reset_zeroes_its_rows_and_they_go_on_as_new() -> None:
     flags = random_contacts(9, 200, 4)
     reset, plain, new = (Feet(4, DT, torch.device("cpu")) for _ in range(3))
@@ -287,18 +251,6 @@ def test_a_reset_zeroes_its_rows_and_they_go_on_as_new() -> None:
         after = getattr(reset, name)
         assert torch.equal(after[mask], getattr(new, name)[mask]), name
         assert torch.equal(after[~mask], getattr(plain, name)[~mask]), name
-
-
-def test_timers_continue_from_their_saved_state() -> None:
-    flags = random_contacts(3, 200, 4)
-    first, second = Feet(4, DT, torch.device("cpu")), Feet(4, DT, torch.device("cpu"))
-    run_through(first, flags[:105])
-    second.load_state_dict(first.state_dict())
-    for row in torch.as_tensor(flags[105:]):
-        first.touch(row)
-        second.touch(row)
-    for name in Feet.timers:
-        assert torch.equal(getattr(first, name), getattr(second, name))
 
 
 def test_the_closed_form_of_the_feet_is_the_models() -> None:

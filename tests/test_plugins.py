@@ -130,15 +130,11 @@ def refusal(*names: str) -> str:
 
 def test_a_file_of_terms_is_there_for_the_configuration_that_names_it_and_for_no_other() -> None:
     write("my_terms.py", LAZY)
-    task = parse_task(compose("train", ["plugins=[my_terms.py]", "+reward.lazy.weight=-1"]))
-    assert task.reward[-1].entry.name == "lazy"
+    for named in ("[my_terms.py]", "my_terms.py"):  # one needs no list
+        task = parse_task(compose("train", [f"plugins={named}", "+reward.lazy.weight=-1"]))
+        assert task.reward[-1].entry.name == "lazy"
     with pytest.raises(ConfigError, match=r"reward\.lazy: unknown reward term 'lazy'"):
         parse_task(compose("train", ["+reward.lazy.weight=-1"]))
-
-
-def test_a_single_name_needs_no_list() -> None:
-    write("my_terms.py", LAZY)
-    parse_train(compose("train", ["plugins=my_terms.py", "+reward.lazy.weight=-1"]))
 
 
 def test_the_environment_variable_names_plugins_for_everything(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -132,12 +132,6 @@ def test_the_value_clip_holds_on_both_sides() -> None:
     assert float(ppo_loss(policy, batch, config).value) == pytest.approx(0.1**2)
 
 
-def test_the_divergence_of_a_distribution_from_itself_is_zero_to_the_last_bit() -> None:
-    torch.manual_seed(0)
-    mean, log_std = 10.0 * torch.randn(1000, 12), torch.randn(12)
-    assert (gaussian_kl(mean, log_std, mean, log_std) == 0).all()
-
-
 # ---------------------------------------------------------------------- rate rule
 
 
@@ -216,13 +210,7 @@ def test_divergences_of_all_minibatches_are_from_the_policy_that_collected_their
     assert [len(k) for k in watched.kl] == [12] * 12  # 3 epochs of 4 minibatches
     np.testing.assert_allclose(watched.kl, watched.own_kl, atol=2e-6, rtol=1e-3)
     assert np.mean(watched.kl) > 1e-4  # so that the tolerance means something
-
-
-def test_the_first_minibatch_of_every_update_has_diverged_by_exactly_nothing(
-    adaptive: tuple[AdaptivePPO, Watched],
-) -> None:
-    _, watched = adaptive
-    assert [k[0] for k in watched.kl] == [0.0] * 12
+    assert [k[0] for k in watched.kl] == [0.0] * 12  # exactly: nothing has changed yet
     assert all(k[-1] > 0.0 for k in watched.kl)
 
 
