@@ -7,11 +7,12 @@ from typing import Any
 
 import torch
 
-import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
+import go1exp.logs.excitations
+import go1exp.logs.record.motions  # noqa: F401  (registers every excitation)
 from go1exp.cli.app import parse
 from go1exp.cli.record import RecordSettings, rig_groups
 from go1exp.config.compose import compose
-from go1exp.config.schema.registry import bind
+from go1exp.config.schema.registry import Term, bind, bind_list
 from go1exp.logs.record import plan, simulate
 from go1exp.logs.recording import Recording
 from go1exp.sim.env.plant import Plant
@@ -22,17 +23,24 @@ def recorded(
     overrides: Sequence[str], effect: dict[str, Any] | None = None
 ) -> tuple[simulate.Rig, tuple[Recording, ...]]:
     """Return the robot and the recordings of ``go1exp record`` with some overrides, and effects on top if any."""
+    settings, rig, terms = ordered(overrides, effect)
+    episodes = plan.episodes(terms, settings)
+    return rig, tuple(simulate.play(rig, episodes, settings.sensors, settings.seed, lambda done, total: None))
+
+
+def ordered(
+    overrides: Sequence[str], effect: dict[str, Any] | None = None
+) -> tuple[RecordSettings, simulate.Rig, list[Term]]:
+    """Return what ``go1exp record`` makes of some overrides: its settings, the robot and the excitations."""
     container = compose("record", ["backend.threads=1", *overrides])
     if effect is not None:
         container["effect"] = effect
     groups = rig_groups(container)
     parts, problems = parse_parts(container, groups)
     assert problems == []
-    terms = [bind("excitation", name, {}, name)[0] for name in container["excitation"]]
+    terms = bind_list("excitation", container["excitation"], "excitation")
     settings = parse(RecordSettings, {k: v for k, v in container.items() if k not in (*groups, "excitation")})
-    rig = simulate.Rig(**parts, physics_dt=settings.physics_dt)
-    episodes = plan.episodes([t for t in terms if t], settings)
-    return rig, tuple(simulate.play(rig, episodes, settings.sensors, settings.seed, lambda done, total: None))
+    return settings, simulate.Rig(**parts, physics_dt=settings.physics_dt), terms
 
 
 def at_rest(

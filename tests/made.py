@@ -1,14 +1,18 @@
-"""A recording's metadata and a robot's state with usual values, for tests that care for a few of them."""
+"""A recording's metadata and a robot's state with usual values, for tests that care for a few; real recordings."""
 
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from go1exp import robot
+from go1exp.base.paths import data_root
 from go1exp.logs.recording import Meta
 from go1exp.robot.messages import LowCmd, LowState
 
@@ -41,3 +45,11 @@ def at(values: np.ndarray, k: int, value: float) -> np.ndarray:
     changed = np.array(values, dtype=float)
     changed[k] = value
     return changed
+
+
+def real(name: str) -> Path:
+    """Return the file or folder of recordings of real robots, or skip the test where there is none."""
+    place = Path(os.environ.get("GO1EXP_DATA", data_root().parent / "shared/data")) / name
+    if not place.exists():
+        pytest.skip(f"the recordings of {name} are not here; GO1EXP_DATA names their folder")
+    return place

@@ -7,7 +7,6 @@ PD law, driven through the package's own excitations, and a base that rocks by a
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,7 +18,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from go1exp.base.paths import data_root
 from go1exp.cli.record import AUDIT
 from go1exp.config.schema import registry
 from go1exp.logs import excitations
@@ -29,7 +27,7 @@ from go1exp.logs.audit.impossible import impossible, without
 from go1exp.logs.audit.signals import Log
 from go1exp.logs.recording import Recording, RecordingError, joint_channels, write
 from go1exp.robot import EFFORT_LIMIT, JOINT_POS_LIMITS, JOINTS, NOMINAL_STANCE, per_joint, soft_limits
-from tests.made import at
+from tests.made import at, real
 from tests.made import meta as made_meta
 
 RATE = 500.0
@@ -717,16 +715,12 @@ def test_short_recordings_are_no_problem(name: str, length: int) -> None:
 
 # ---------------------------------------------------------------------- real recordings
 
-Importer = Callable[..., list[Recording]]
 
-
-def real(importer: str, *path: str) -> list[Recording]:
+def imported(importer: str, path: str = "") -> Recording:
     from go1exp.logs.importers import import_recordings
 
-    folder = Path(os.environ.get("GO1EXP_DATA", data_root().parent / "shared/data"))
-    if not folder.is_dir():
-        pytest.skip("the folder of measured data is not here (GO1EXP_DATA)")
-    return import_recordings(importer, folder.joinpath(importer, *path), {})
+    (recording,) = import_recordings(importer, real(importer) / path, {})
+    return recording
 
 
 def encoder_steps(report: AuditReport, prefix: str) -> list[float]:
@@ -734,7 +728,7 @@ def encoder_steps(report: AuditReport, prefix: str) -> list[float]:
 
 
 def test_the_go2_reports_speeds_that_are_too_large() -> None:
-    (recording,) = real("go2_in_air")
+    recording = imported("go2_in_air")
     report = audit(recording)
     assert flaws(report) == {("scale", name, "suspect") for name in joint_channels("qd", recording.meta.joints)}
     sizes = [f.size or 0 for f in report.by_check("scale")]
@@ -744,9 +738,8 @@ def test_the_go2_reports_speeds_that_are_too_large() -> None:
 
 
 def test_scaler_reports_speeds_that_are_too_large_and_late() -> None:
-    (recording,) = real("scaler_walk_mocap", "run_15.npz")
-    folder = Path(os.environ.get("GO1EXP_DATA", data_root().parent / "shared/data"))
-    speed = np.load(folder / "scaler_walk_mocap/run_15.npz", allow_pickle=False)["joint_vel"].reshape(-1, 12)
+    recording = imported("scaler_walk_mocap", "run_15.npz")
+    speed = np.load(real("scaler_walk_mocap/run_15.npz"), allow_pickle=False)["joint_vel"].reshape(-1, 12)
     names = joint_channels("qd", recording.meta.joints)  # left out by the importer, for this very flaw
     report = audit(with_(recording, **dict(zip(names, np.ascontiguousarray(speed.T), strict=True))))
     assert {f.channel for f in report.by_check("scale") if f.verdict == "bad"} == set(names)
@@ -759,7 +752,7 @@ def test_scaler_reports_speeds_that_are_too_large_and_late() -> None:
 
 @pytest.mark.parametrize("design", ["design_A_0", "design_C_0"])
 def test_the_ak80s_messages_are_recognised(design: str) -> None:
-    (recording,) = real("ak80_double_pendulum", design, "trajectory_00.npz")
+    recording = imported("ak80_double_pendulum", f"{design}/trajectory_00.npz")
     report = audit(recording)
     np.testing.assert_allclose(encoder_steps(report, "q_"), [3.8147e-4] * 2, rtol=1e-3)
     np.testing.assert_allclose(encoder_steps(report, "tau_est"), [5.8608e-3] * 2, rtol=1e-3)
@@ -767,8 +760,7 @@ def test_the_ak80s_messages_are_recognised(design: str) -> None:
 
 
 def test_a_real_go1_snippet_is_sound() -> None:
-    (recording,) = real("go1_walk_snippet")
-    assert audit(recording).flaws == []
+    assert audit(imported("go1_walk_snippet")).flaws == []
 
 
 def trotting(order: tuple[int, ...] = tuple(range(12)), flip: int | None = None) -> Recording:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import zipfile
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -13,7 +12,6 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from go1exp.base.paths import data_root
 from go1exp.gap.actuator_net.dataset import fingerprint, smooth_motion, split, windows
 from go1exp.gap.actuator_net.fitting import FitResult, fit, plot
 from go1exp.gap.actuator_net.report import text
@@ -512,20 +510,13 @@ def test_smoothing_keeps_a_cubic_and_its_derivatives() -> None:
 # ---------------------------------------------------------------------- a measured drive
 
 
-def measured(folder: str) -> Path:
-    root = Path(os.environ.get("GO1EXP_DATA", data_root().parent / "shared/data"))
-    if not (root / folder).is_dir():
-        pytest.skip(f"no {folder} in {root}; set GO1EXP_DATA")
-    return root / folder
-
-
 def test_the_net_beats_the_linear_map_on_a_measured_drive() -> None:
     """Elbow and shoulder of the AK80 double pendulum: episode 02 held out, as its command's repetition 13 is."""
     from go1exp.logs.importers import import_recordings
 
-    folder = measured("ak80_double_pendulum") / "design_A_0"
+    folder = made.real("ak80_double_pendulum/design_A_0")
     names = [folder / f"trajectory_{n}.npz" for n in ("00", "01", "02", "03", "04")]
-    made = [import_recordings("ak80_double_pendulum", name, {})[0] for name in names]
+    logs = [import_recordings("ak80_double_pendulum", name, {})[0] for name in names]
     settings = FitSettings(
         inputs=("tau_cmd", "velocity"),
         history=20,
@@ -535,7 +526,7 @@ def test_the_net_beats_the_linear_map_on_a_measured_drive() -> None:
         holdout=("ak80_a_trajectory_02",),
         validation=("ak80_a_trajectory_04",),
     )
-    got = fit(made, settings)
+    got = fit(logs, settings)
     for joint in ("shoulder", "elbow"):
         cell = got.report.cell(joint)
         assert cell.rmse["net"] < 0.9 * cell.rmse["linear"]

@@ -1,20 +1,34 @@
-"""Which terms are certified or compensating, and why (``go1exp/gap/search/certainty.py``)."""
+"""What is certain: terms (``search/certainty.py``), values that are alike, and what the user accepts."""
 
 from __future__ import annotations
 
+import ast
+import dataclasses
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 
-from go1exp.gap.answer import Answer, bounded_joints, weak_joints
+import go1exp.gap
+from go1exp.cli.gap import GapVerb
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import ConfigError, members
+from go1exp.config.schema.settings import parse
+from go1exp.gap.answer import Answer, bounded_joints, decide, weak_joints
+from go1exp.gap.files import from_dict
+from go1exp.gap.report import words
 from go1exp.gap.report.words import sentence
-from go1exp.gap.result import Candidate, GapSettings, NamedEffect
+from go1exp.gap.result import AngleErrors, Candidate, GapResult, GapSettings, NamedEffect
+from go1exp.gap.score import angle_errors
+from go1exp.gap.score.likelihood import KNEE, excess, log_chi2, removed
+from go1exp.gap.search import significance, thresholds, tolerances
 from go1exp.gap.search.candidates import Trial
 from go1exp.gap.search.certainty import beside_a_gap, doubt, spanned, widened
+from go1exp.gap.search.single_cause import differ
 from go1exp.gap.search.state import LastCheck, Search
 from go1exp.sim.effects.tolerances import DECLARED, declared
 
@@ -231,3 +245,235 @@ def test_strength_acts_as_both_gains_together_and_as_neither_alone() -> None:
     assert not spanned(matrix, 3, np.array([0]))
     assert not spanned(matrix, 2, np.array([0, 1, 3]))
     assert not spanned(matrix, 3, np.array([], dtype=int))
+
+
+# ---------------------------------------------------------------------- values that may be the same at all joints
+
+
+TOLERANCE = declared(("encoder_offset", "offset")).tolerance
+WALK = 0.001 * np.array([9.5, 8.3, 9.6, 9.6, 9.6, 9.6, 11.4, 9.6, 6.9, 9.6, 9.7, 9.5])
+"""Offsets like those that walks gave, rad."""
+
+EVEN = np.ones(12)
+
+
+def resampled(values: np.ndarray, sd: np.ndarray, seed: int = 0) -> np.ndarray:
+    """Return resampled values (200, J) with these errors."""
+    return values + sd * np.random.default_rng(seed).standard_normal((200, len(values)))
+
+
+def test_values_within_one_tolerance_are_alike_however_well_they_are_known() -> None:
+    close = 0.009 + 0.0029 * np.linspace(0.0, 1.0, 12)
+    assert not differ(close, resampled(close, 1e-7 * EVEN), TOLERANCE)
+
+
+def test_a_larger_difference_counts_only_beyond_its_own_errors() -> None:
+    assert np.ptp(WALK) > TOLERANCE
+    assert not differ(WALK, resampled(WALK, 0.0009 * EVEN), TOLERANCE)
+    assert differ(WALK, resampled(WALK, 0.0001 * EVEN), TOLERANCE)
+    assert differ(WALK, np.tile(WALK, (200, 1)), TOLERANCE)
+
+
+def test_a_joint_of_which_little_is_known_hides_no_others() -> None:
+    values, sd = np.full(12, 0.009), 0.0002 * EVEN
+    values[4], sd[4] = 0.02, 0.01
+    assert not differ(values, resampled(values, sd), TOLERANCE)
+    values[7] = 0.014
+    assert differ(values, resampled(values, sd), TOLERANCE)
+
+
+def test_errors_that_joints_share_are_none_of_a_difference() -> None:
+    shared = 0.01 * np.random.default_rng(1).standard_normal((200, 1))
+    assert differ(WALK, resampled(WALK, 0.0001 * EVEN) + shared, TOLERANCE)
+
+
+def test_where_resamples_lie_does_not_matter_but_how_far_they_spread() -> None:
+    moved = resampled(WALK, 0.0001 * EVEN) + 0.003 * np.arange(12)
+    assert differ(WALK, moved, TOLERANCE)
+    assert not differ(WALK, resampled(WALK, 0.0009 * EVEN) + 0.003 * np.arange(12), TOLERANCE)
+
+
+@pytest.mark.parametrize("spread", [0.0, 1.0], ids=["one value", "a tolerance apart"])
+def test_causes_that_are_alike_are_refused_no_more_often_than_said(spread: float) -> None:
+    rng = np.random.default_rng(2)
+    sd = 0.001 * rng.uniform(0.3, 3.0, 12)
+    true = 0.009 + spread * TOLERANCE * (np.arange(12) % 2)
+    trials = [differ(true + sd * rng.standard_normal(12), resampled(true, sd, k), TOLERANCE) for k in range(300)]
+    assert np.mean(trials) <= thresholds.SHARED_LEVEL + 0.02
+
+
+def test_what_one_fault_may_give_to_all_joints_is_known_of_the_effects_themselves() -> None:
+    alike = {name for name in members("effect") if tolerances.identification(name).uniform}
+    assert alike == {"strength", "kp_scale", "link_mass", "encoder_offset"}
+
+
+# ---------------------------------------------------------------------- what the user accepts
+
+
+def accepting(accept: str) -> GapVerb:
+    container = compose("gap", ["logs=recordings", f"accept={accept}"])
+    return parse(GapVerb, {k: v for k, v in container.items() if k not in ("robot", "model")})
+
+
+@pytest.mark.parametrize(("given", "rad"), [("2mrad", 0.002), ("0.002", 0.002), ("1deg", math.pi / 180), ("0", 0.0)])
+def test_an_angle_is_in_rad_or_says_its_unit(given: str, rad: float) -> None:
+    assert accepting(given).accept == pytest.approx(rad)
+
+
+@pytest.mark.parametrize("given", ["2inch", "mrad", "-1", "much"])
+def test_another_angle_is_refused_in_one_line(given: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        accepting(given)
+    assert len(error.value.problems) == 1
+    assert str(error.value).startswith("accept = ")
+
+
+def asked(**changes: Any) -> Any:
+    signal = dict.fromkeys(("coulomb", "viscous"), 100.0)
+    return SimpleNamespace(**{"settings": GapSettings(), "signal": signal, "first": 80.0, **changes})
+
+
+def named(status: Literal["certified", "compensating"]) -> NamedEffect:
+    return NamedEffect("coulomb", ("knee",), {}, {}, ("coulomb",), status)
+
+
+def test_what_remains_is_right_if_it_is_accepted_and_the_names_stay() -> None:
+    sure = (named("certified"),)
+    assert decide(asked(), sure, 40.0, False) == "partly explained"
+    assert decide(asked(), sure, 40.0, True) == "explained"
+    assert decide(asked(), (), 80.0, False) == "unexplained"
+    assert decide(asked(), (), 80.0, True) == "no gap"
+    assert decide(asked(signal={"coulomb": 0.0}), (), 80.0, True) == "not excited"
+
+
+def test_names_none_of_which_is_certain_explain_nothing_however_near_they_come() -> None:
+    sure, unsure = named("certified"), named("compensating")
+    assert decide(asked(), (unsure, unsure), 0.1, False) == "partly explained"
+    assert decide(asked(), (unsure,), 0.1, True) == "explained"
+    assert decide(asked(), (unsure, sure), 0.1, False) == "explained"
+    quick = asked(settings=GapSettings(bootstraps=0))  # how certain they are was not asked
+    assert decide(quick, (unsure,), 0.1, False) == "explained"
+
+
+def test_every_joint_of_a_window_must_be_within_beside_the_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    off = 1e-3 * np.array([[1.0, 1.0], [1.0, 2.2], [0.0, 3.0], [0.5, 0.5]])  # windows by joints
+    monkeypatch.setattr(angle_errors, "of_angles", lambda scorer, residual, windows: off[windows])
+    quiet: Any = SimpleNamespace(scale=np.full((4, 1, 1), 1e-6))
+    noisy: Any = SimpleNamespace(scale=np.full((4, 1, 1), 1e-3))
+    every, empty = np.arange(4), np.empty(0)
+    assert angle_errors.within(quiet, empty, every, 0.002) == 0.5
+    assert angle_errors.within(noisy, empty, every, 0.002) == 0.75  # 2.2 is less than the root of 2² + 1²
+    assert angle_errors.within(quiet, empty, every, 0.003001) == 1.0
+
+
+def test_the_report_says_the_share_and_older_files_have_none() -> None:
+    errors = AngleErrors(10, (0.005, 0.001), 0.8, 0.1, {"a": (0.005, 0.001)}, {"e": (0.005, 0.001)}, (0.2, 0.95))
+    assert "Within the accepted error: 20 % of the windows before, 95 % after." in words.angles(errors)
+    plain = GapResult("no gap", "", errors=errors).as_dict()
+    assert from_dict(plain).errors == errors
+    del plain["errors"]["within"], plain["tolerances"]
+    assert from_dict(plain).errors == dataclasses.replace(errors, within=None)
+    assert "accept" not in words.angles(dataclasses.replace(errors, within=None))
+
+
+def test_a_verdict_by_what_is_accepted_says_what_would_change_it() -> None:
+    about = {"settings": {"accept": 0.006, "adequate": 0.5}}
+    result = GapResult("no gap", "", excess={"null": 400.0, "box": 77.0, "final": 77.0}, provenance=about)
+    assert words.would_change(result)[0].startswith("An accept below 6 mrad: relative to the noise, 78 is above 1.5")
+    small = dataclasses.replace(result, excess={"null": 1.0, "box": 0.2, "final": 0.2})
+    assert words.would_change(small)[0].startswith("A held-out error above 1.5")
+
+
+# ---------------------------------------------------------------------- windows at rest and wild windows
+
+
+def test_a_joint_that_sticks_exactly_decides_nothing() -> None:
+    """In a window at rest chi2 of a model with dry friction falls to 1e-11; that is no gain of 25 over a floor of 1."""
+    before = np.array([[1.0], [50.0], [40.0], [60.0], [45.0]])
+    rests = np.array([[1e-11], [55.0], [44.0], [66.0], [49.0]])  # worse in all windows that move
+    moves = np.array([[1.0], [25.0], [20.0], [30.0], [22.0]])
+    gain = significance.gains(before, np.stack([rests, moves]))
+    assert gain.max(axis=1)[0] <= 1.0
+    assert gain.mean(axis=1).argmax() == 1
+    np.testing.assert_allclose(gain[0, 1:], -np.log([1.1, 1.1, 1.1, 49 / 45]), rtol=1e-9)
+
+
+def test_below_the_floor_the_logarithm_goes_on_as_a_line() -> None:
+    chi2 = np.array([1e-12, 0.5, 1.0 - 1e-9, 1.0, 1.0 + 1e-9, 7.0])
+    np.testing.assert_allclose(log_chi2(chi2), [-1.0, -0.5, 0.0, 0.0, 0.0, np.log(7.0)], atol=1e-8)
+    grid = np.linspace(0.01, 5.0, 4000)
+    np.testing.assert_allclose(np.gradient(log_chi2(grid), grid), 1 / np.maximum(grid, 1.0), atol=2e-3)
+
+
+def test_no_other_logarithm_of_chi2_is_taken() -> None:
+    """One place: a fit, a test or a screening with a logarithm of its own would have no floor again."""
+    taken = []
+    for file in sorted(Path(go1exp.gap.__file__).parent.rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "np.log":
+                taken.append(f"{file.name}: {ast.unparse(node)}")
+    # Schwarz's criterion, an ablation, is defined by the plain logarithm
+    assert [line for line in taken if not line.startswith(("likelihood.py", "candidates.py"))] == []
+
+
+def test_excess_is_the_plain_mean_where_no_window_is_wild() -> None:
+    chi2 = np.random.default_rng(0).uniform(0.3, 0.95 * KNEE, (40, 4))
+    assert excess(chi2) == pytest.approx(chi2.mean() - 1.0)
+    assert np.isnan(excess(np.empty((0, 4))))
+
+
+def test_a_few_wild_windows_do_not_decide_what_is_gone() -> None:
+    """5 % of the windows get worse tenfold, all others four times better: a plain mean sees nothing gained."""
+    rng = np.random.default_rng(1)
+    before = 100.0 * rng.lognormal(0.0, 0.3, (200, 1))
+    before[:10] *= 20.0
+    after = before / 4.0
+    after[:10] = 10.0 * before[:10]
+    assert after.mean() > before.mean()
+    assert removed(excess(before), excess(after)) > 0.5
+    assert excess(before) < 150.0 < before.mean()
+
+
+def test_a_gap_that_few_windows_show_is_still_one() -> None:
+    settings = GapSettings()
+    chi2 = np.full((160, 1), 0.9)
+    chi2[:8] = 100.0  # a limit that is reached in a twentieth of the windows; a median would not see it
+    assert excess(chi2) > settings.adequate
+    assert np.median(chi2) < 1.0
+
+
+def test_errors_are_told_in_mrad_by_joint_and_episode() -> None:
+    """Two joints, four windows of two episodes, noise of 0.5 mrad; an initial state that explains a constant."""
+    rng, samples = np.random.default_rng(2), 50
+    windows = SimpleNamespace(
+        joints=("hip", "calf"),
+        quantities=("q",),
+        t=np.zeros((4, samples)),
+        valid=np.ones((4, samples), dtype=bool),
+        episode=np.array([0, 0, 1, 1]),
+    )
+    machine = SimpleNamespace(groups=((0, 1),))
+    state = np.zeros((4, 1, 2 * samples, 1))
+    state[:, 0, ::2] = 1e4  # the hip's angle may be off by a constant
+    scorer: Any = SimpleNamespace(
+        windows=windows,
+        replayer=SimpleNamespace(machine=machine),
+        scale=np.full((4, 1, 2), 0.5e-3),
+        state=state,
+        common=np.zeros(1, dtype=bool),
+    )
+    wave = np.sin(np.linspace(0.0, 6 * np.pi, samples, endpoint=False))
+    before = np.zeros((4, 1, samples, 2))
+    before[..., 0] = 20.0 + 0.1 * rng.standard_normal((4, 1, samples))
+    before[..., 1] = np.sqrt(2.0) * np.array([8.0, 8.0, 16.0, 16.0])[:, None, None] * wave  # 4 and 8 mrad
+    after = before * np.array([1.0, 0.5])
+    after[3] *= 100.0  # one wild window
+    flat, halved = (r.reshape(4, 1, -1) for r in (before, after))
+    errors = angle_errors.angle_errors((scorer, scorer), flat, halved, np.arange(4), ["slow", "fast"])
+    assert errors.by_joint["hip"][0] < 0.1e-3
+    assert errors.by_joint["calf"] == pytest.approx((6e-3, 3e-3), rel=0.02)
+    assert errors.by_episode["slow"] == pytest.approx((4e-3 / np.sqrt(2), 2e-3 / np.sqrt(2)), rel=0.02)
+    assert errors.removed == pytest.approx(0.5, abs=0.01)
+    assert errors.worse == 0.25
+    assert "The error of a window decreases by 50 % in the median" in words.angles(errors).replace("50.0", "50")
+    assert ("calf", "6", "3") in words.angle_rows(errors)

@@ -14,12 +14,24 @@ import mujoco
 import numpy as np
 import pytest
 
-from benchmarks.gap import cases, damage, generate, known, laws, logger, outside
+import go1exp.logs.excitations
+import go1exp.logs.record.motions  # noqa: F401  (registers every excitation)
+from benchmarks.gap import cases, damage, generate, known, laws, logger, outside, score
 from benchmarks.gap.motions import HIGH, LOW, MOTIONS, RATE
 from benchmarks.gap.simulate import Episode, Samples, build, simulate
 from benchmarks.gap.truth import Truth, apply
+from benchmarks.gap_solve import solve
 from go1exp import robot
+from go1exp.base.paths import data_root
+from go1exp.cli.app import parse
+from go1exp.cli.record import RIG, RecordSettings
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import bind
+from go1exp.logs.excitations import Motion
+from go1exp.logs.record import plan
+from go1exp.logs.record.simulate import Rig, play
 from go1exp.logs.recording import RecordingError, read_folder
+from go1exp.sim.task import parse_parts
 
 HERE = Path(cases.__file__).parent
 ALLOWED = {"go1exp", "go1exp.base.paths", "go1exp.logs.recording", "go1exp.robot"}
@@ -443,3 +455,118 @@ def test_the_answer_is_the_robot_and_not_only_what_was_added() -> None:
     assert not case.answer["clean"]
     np.testing.assert_allclose(effect["params"]["added"], (case.truth.armature - nominal)[at], atol=1e-9)
     assert np.abs(np.subtract(effect["params"]["added"], effect["drawn"]["added"])).max() > 1e-6
+
+
+# ---------------------------------------------------------------------- the library's effects mean the same
+
+
+QUIET = [f"sensors.{name}={{noise: 0.0, step: 0.0}}" for name in ("q", "qd", "tau_est", "gyro", "acc", "attitude")]
+SIGNED = ("base_tilt", "encoder_offset", "link_com", "cogging", "parallel_stiffness")
+SHAPED = (
+    "asymmetric_friction",
+    "torque_speed_limit",
+    "command_delay",
+    "load_friction",
+    "armature",
+    "stribeck",
+    "point_load",
+)
+
+
+def library(names: tuple[str, ...], values: dict[str, cases.Values], episode: Episode) -> np.ndarray:
+    words = ["backend.threads=1", "physics_dt=0.0005", "sensors.jitter=0.0", "sensors.dropped=0.0", *QUIET]
+    container = compose("record", words)
+    parts, problems = parse_parts(container, RIG)
+    assert problems == []
+    settings = parse(RecordSettings, {k: v for k, v in container.items() if k not in (*RIG, "excitation")})
+    rig = Rig(**parts, physics_dt=settings.physics_dt)
+    terms = []
+    for name in names:
+        plain = {k: v if isinstance(v, float) else tuple(float(x) for x in v) for k, v in values[name].items()}
+        term, found = bind("effect", name, plain, name)
+        assert found == []
+        assert term is not None
+        terms.append(term)
+    motion = Motion(episode.target, episode.on, episode.target[0].copy(), "suspended")
+    one = plan.Episode("e", "steps", motion, episode.kp, episode.kd, episode.hang, None, 0)
+    (recording,) = play(
+        dataclasses.replace(rig, effect=tuple(terms)), [one], settings.sensors, 0, lambda done, total: None
+    )
+    return recording.joint("q")
+
+
+@pytest.mark.slow("benchmarks/", "go1exp/sim/effects/", "go1exp/logs/excitations/", "go1exp/logs/record/")
+def test_both_sides_move_alike_under_the_same_effects() -> None:
+    """Each group at 5 tolerances, all of it at once: what the effects change differs by some per cent between both."""
+    rng, joints = np.random.default_rng(3), np.arange(12)
+    target, on = MOTIONS["steps"](np.arange(400) / RATE, rng)
+    episode = Episode("e", "steps", target, on, 35.0, 0.6, (0.0, 0.3))
+
+    def mine(truth: Truth) -> np.ndarray:
+        return simulate(truth, [episode], 2.5e-4, rng, np.zeros(12, dtype=bool)).q[:, 0]
+
+    plain, theirs = mine(Truth()), library((), {}, episode)
+    for group in (SIGNED, SHAPED):
+        values = {name: cases.draw_values(name, 5.0, joints, rng) for name in group}
+        truth = Truth()
+        for name in group:
+            apply(truth, name, values[name], joints)
+        here, there = mine(truth) - plain, library(group, values, episode) - theirs
+        change, differ = (np.sqrt(np.mean(x**2, axis=0)) for x in (here, here - there))
+        assert (change > 2e-3).all()
+        assert (differ < 0.1 * change).all(), dict(zip(joints, (differ / change).round(3), strict=True))
+
+
+# ---------------------------------------------------------------------- a small fixed slice, solved and scored
+
+
+SEED = 20261121
+
+SLICE = (
+    ("null", 1),
+    ("single", 2 * len(cases.SUSPENDED) + cases.SUSPENDED.index("lag")),
+    ("outside", 0),
+    ("damaged", 2),
+)
+"""Kind and index: a background within tolerances, lag at 5 tolerances, one beyond the library, lost samples."""
+
+
+FAST = ("damaged",)
+ABOUT = ("benchmarks/gap/", "benchmarks/gap_solve.py", "go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/physics/")
+
+
+@pytest.mark.parametrize(
+    ("kind", "index"),
+    [pytest.param(*case, id=case[0], marks=[] if case[0] in FAST else [pytest.mark.slow(*ABOUT)]) for case in SLICE],
+)
+def test_a_sealed_case(kind: str, index: int, tmp_path: Path) -> None:
+    case = cases.make(kind, index, SEED, count=6, seconds=3.0)
+    generate.write_case(case, out=tmp_path / "cases")
+    solve(tmp_path / "cases" / case.name, tmp_path / "out", {})
+    results = score.read_results(tmp_path / "out")
+    found = score.evaluate({case.name: case.answer}, results)
+    failures = {name: lines for name, lines in found.failures.items() if lines}
+    if kind == "single":
+        assert found.figures["first_exact"][0] == found.figures["in_set"][0] == 1.0, failures
+        assert results[case.name]["verdict"] in ("explained", "partly explained")
+        assert results[case.name]["closed"] > 0.9
+    elif kind == "null":
+        assert found.figures["false_names"][0] == 0.0, failures
+    elif kind == "outside":
+        assert found.figures["outside_handled"][0] == 1.0, failures
+    else:
+        assert results[case.name]["verdict"] == "bad log"
+
+
+def test_the_bundled_case_is_what_the_generator_makes() -> None:
+    """It hides dry friction at the thighs; its README says how it was made."""
+    case = cases.make("single", 2, 5, 6, 3.0, ("coulomb",))
+    fresh = {r.meta.episode: r for r in generate.recordings(case)}
+    bundled = read_folder(data_root() / "assets/demo/suspended_go1")
+    assert {r.meta.episode for r in bundled} == set(fresh)
+    for recording in bundled:
+        assert recording.meta == fresh[recording.meta.episode].meta
+        assert abs(recording.joint("q") - fresh[recording.meta.episode].joint("q")).max() < 1e-9
+    (effect,) = json.loads(generate.seal({case.name: case.answer})[0])[case.name]["effects"]
+    assert effect["effect"] == "coulomb"
+    assert {j.split("_")[1] for j in effect["joints"]} == {"thigh"}

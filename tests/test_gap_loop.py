@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from go1exp.cli import main
 from go1exp.gap.design.choice import Worth
 from go1exp.gap.design.plan import Attitude, Design, DesignError, DesignSettings, Used
 from go1exp.gap.design.rehearsal import Rehearsal
@@ -20,6 +19,7 @@ from go1exp.gap.stages.next import NextResult, Verdict
 from go1exp.logs.record.simulate import held_quat
 from go1exp.logs.recording import read
 from go1exp.robot import JOINTS
+from tests.command import refuse
 from tests.laboratory import recorded
 
 ONE_OR_TWO = NamedEffect("viscous", JOINTS, {}, {}, ("viscous", "kd_scale"), "certified")
@@ -117,28 +117,22 @@ def test_nothing_named_ends_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
         (["search.alpha=2", "design.seconds=1"], "2 problems"),
     ],
 )
-def test_what_cannot_be_is_refused(
-    words: list[str], complaint: str, monkeypatch: pytest.MonkeyPatch, capsys: Any, tmp_path: Path
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sys.argv", ["go1exp", "gap", "loop", *words])
-    assert main() == 2
-    assert complaint in capsys.readouterr().err
+def test_what_cannot_be_is_refused(words: list[str], complaint: str, tmp_path: Path) -> None:
+    done = refuse(tmp_path, "gap", "loop", *words)
+    assert (done.returncode, complaint in done.stderr) == (2, True), done.stderr
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow("go1exp/gap/", "go1exp/cli/gap_next.py", "conf/gap_loop.yaml", "tests/")
-def test_a_circle_on_the_simulated_robot(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_circle_on_the_simulated_robot(tmp_path: Path) -> None:
     """A larger kd in the logs of one gain is kd or friction; one designed recording leaves kd."""
-    monkeypatch.chdir(tmp_path)
     search = ["window_s=0.2", "physics_dt=0.002", "stride_s=0.6", "bootstraps=5", "shortlist=3", "overlays=0"]
     words = [
         *("effect=kd_scale", "effect.kd_scale.scale=1.7", "excitation=[multisine,gait]", "seeds=[0,1,2]"),
         *("seconds=4", "rounds=1", "physics_dt=0.001", "backend.threads=1", *(f"search.{word}" for word in search)),
         *("design.designs=12", "design.refine=0", "design.seconds=4", "out=loop"),
     ]
-    monkeypatch.setattr("sys.argv", ["go1exp", "gap", "loop", *words])
-    status = main()
+    status = refuse(tmp_path, "gap", "loop", *words).returncode
     rows = json.loads((tmp_path / "loop/loop.json").read_text())
     assert [sorted(names) for names in rows[0]["names"]] == [["kd_scale", "viscous"]]  # equals: either comes first
     assert rows[0]["power"] < 0.1

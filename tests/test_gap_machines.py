@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -36,11 +35,11 @@ from go1exp.gap.stages.explain import explain
 from go1exp.logs.importers import import_recordings
 from go1exp.logs.recording import Recording, joint_channel
 from go1exp.sim.effects.tolerances import declared
+from go1exp.sim.physics.fixed_base import FixedBaseError, build_fixed_base
 from tests import made
 from tests.laboratory import at_rest
 
 MODELS = sorted(f.stem for f in (data_root() / "conf/model").glob("*.yaml") if f.stem != "go1")
-DATA = Path(os.environ.get("GO1EXP_DATA", data_root().parent / "shared/data"))
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 G = 9.81
 
@@ -461,10 +460,8 @@ def test_friction_hidden_in_a_double_pendulum_of_torque_drives_is_named() -> Non
     ],
 )
 def test_real_recordings_can_be_compared(source: str, folder: str, name: str) -> None:
-    if not (DATA / folder).exists():
-        pytest.skip(f"{folder}: real recordings are not here (GO1EXP_DATA)")
     robot = machine(name)
-    logs = import_recordings(source, DATA / folder, {})[:4]
+    logs = import_recordings(source, made.real(folder), {})[:4]
     defaults = {k: v for k, v in dataclasses.asdict(robot.config.search).items() if v is not None}
     fitting, ready = prepare(logs, robot, GapSettings(**defaults))
     assert ready.ignored == ("qd",)
@@ -475,9 +472,7 @@ def test_real_recordings_can_be_compared(source: str, folder: str, name: str) ->
 
 def test_the_go2s_rows_are_closer_than_its_file_says() -> None:
     """The clock that hips and thighs tell fits the calves, which had no part in it."""
-    if not (DATA / "go2_in_air").exists():
-        pytest.skip("go2_in_air: real recordings are not here (GO1EXP_DATA)")
-    (log,) = import_recordings("go2_in_air", DATA / "go2_in_air", {})
+    (log,) = import_recordings("go2_in_air", made.real("go2_in_air"), {})
     tell = np.array([not j.endswith("calf") for j in log.meta.joints])
     found = clock_of_speeds(log.t, log.joint("q")[:, tell], log.joint("qd")[:, tell])
     assert len(found) / (found[-1] - found[0]) == pytest.approx(226.0, abs=4.0)
@@ -489,3 +484,45 @@ def test_a_model_that_is_no_xml_is_told_with_its_line(tmp_path: Path) -> None:
     (tmp_path / "arm.xml").write_text("<mujoco>\n<worldbody>\n<body>\n</worldbody>\n</mujoco>\n")
     with pytest.raises(ConfigError, match=r"arm\.xml': not a MuJoCo model \(XML parse error .* Line number=3"):
         machine("ak80_double_pendulum_a", mjcf=str(tmp_path / "arm.xml"))
+
+
+# ---------------------------------------------------------------------- files of a robot of one's own
+
+
+LINK = '<inertial><mass value="0.3"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial>'
+URDF = f"""<robot name="bench"><link name="base_link">{LINK}</link><link name="arm_link">{LINK}{{visual}}</link>
+<joint name="arm" type="revolute"><parent link="base_link"/><child link="arm_link"/><axis xyz="0 1 0"/>
+<limit lower="-2" upper="2" effort="2" velocity="8"/></joint></robot>"""
+MJCF = """<mujoco><compiler fusestatic="true"/><worldbody><body name="base_link">
+<inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/><body name="arm_link"><joint name="arm"/>
+<inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/></body></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(("name", "text"), [("arm.urdf", URDF.format(visual="")), ("arm.xml", MJCF)])
+def test_a_base_without_a_joint_remains_a_body(tmp_path: Path, name: str, text: str) -> None:
+    (tmp_path / name).write_text(text)
+    model = build_fixed_base(tmp_path / name, "base_link", ["arm"], [2.0], 0.001)
+    assert [model.body(k).name for k in range(model.nbody)] == ["world", "trunk", "arm"]
+
+
+def test_a_mesh_that_is_missing_is_named_in_one_line(tmp_path: Path) -> None:
+    mesh = '<collision><geometry><mesh filename="meshes/link.stl"/></geometry></collision>'
+    (tmp_path / "arm.urdf").write_text(URDF.format(visual=mesh))
+    with pytest.raises(FixedBaseError, match=r"^mjcf = .*arm\.urdf.*link\.stl") as caught:
+        build_fixed_base(tmp_path / "arm.urdf", "base_link", ["arm"], [2.0], 0.001)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_link_whose_mass_lies_on_its_joint_takes_another_mass(tmp_path: Path) -> None:
+    """MuJoCo calls such a body simple, and refuses to move its centre of mass afterwards."""
+    text = """<mujoco><worldbody><body name="stand"><inertial mass="1" pos="0 0 0" diaginertia="1e-3 1e-3 1e-3"/>
+      <body name="arm"><joint name="arm" axis="0 0 1"/>
+        <inertial mass="0.1" pos="0 0 0" diaginertia="1e-2 1e-2 1e-2"/></body></body></worldbody></mujoco>"""
+    (tmp_path / "arm.xml").write_text(text)
+    model = build_fixed_base(tmp_path / "arm.xml", "stand", ["arm"], [2.0], 0.001)
+    assert model.body_simple[model.body("arm").id] == 0
+    model.body("arm").ipos[:] = [0.05, 0.0, 0.0]
+    data = mujoco.MjData(model)
+    mujoco.mj_setConst(model, data)
+    mujoco.mj_forward(model, data)
+    assert data.M[0] == pytest.approx(1e-2 + 0.1 * 0.05**2)

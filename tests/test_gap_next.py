@@ -14,7 +14,6 @@ import pytest
 import torch
 from scipy.optimize import least_squares
 
-from go1exp.cli import main
 from go1exp.cli.gap_next import text
 from go1exp.config.schema.registry import bind
 from go1exp.gap import files as gap_files
@@ -37,7 +36,6 @@ from go1exp.gap.result import GapResult, GapSettings, NamedEffect
 from go1exp.gap.robots.description import ModelConfig
 from go1exp.gap.robots.fixed_base import FixedBase
 from go1exp.gap.robots.go1 import suspended
-from go1exp.gap.score.linear import Layout
 from go1exp.gap.search import tolerances
 from go1exp.gap.stages import next as stage_next
 from go1exp.gap.stages.next import NextResult
@@ -48,6 +46,7 @@ from go1exp.logs.record.simulate import held_quat
 from go1exp.logs.recording import Recording, joint_channels
 from go1exp.robot import JOINTS, NOMINAL_STANCE, soft_limits
 from tests import made
+from tests.command import refuse
 from tests.laboratory import at_rest, recorded
 
 ARM = """<mujoco><compiler angle="radian"/><worldbody><body name="stand" pos="0 0 1">
@@ -357,18 +356,20 @@ def test_logs_of_another_search_are_refused() -> None:
         stage_next.design(answer(provenance={"logs": {"walk": "x"}}), told_go1(), robot(), SETTINGS, DesignSettings())
 
 
-def test_the_verb_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
-    monkeypatch.chdir(tmp_path)
-    for words, complaint in (
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
         (["logs=recordings"], "verdict.json: no such file; run go1exp gap explain first"),
         ([], "logs: required"),
         (["logs=x", "design.seconds=0.5"], "design.seconds = 0.5"),
         (["logs=x", "design.limits.speed=2"], "design.limits.speed = 2"),
         (["logs=x", "design.gains=[]"], "design.gains"),
-    ):
-        monkeypatch.setattr("sys.argv", ["go1exp", "gap", "next", *words])
-        assert main() != 0
-        assert complaint in capsys.readouterr().err
+    ],
+)
+def test_the_verb_says_what_is_missing(words: list[str], complaint: str, tmp_path: Path) -> None:
+    done = refuse(tmp_path, "gap", "next", *words)
+    assert done.returncode != 0
+    assert complaint in done.stderr
 
 
 def test_logs_that_the_search_left_out_are_left_out_here_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -385,8 +386,7 @@ def test_logs_that_the_search_left_out_are_left_out_here_too(tmp_path: Path, mon
         return NextResult("nothing left", (), (), None, 500.0, JOINTS)
 
     monkeypatch.setattr(stage_next, "design", design)
-    monkeypatch.setattr("sys.argv", ["go1exp", "gap", "next", f"logs={tmp_path}", f"out={tmp_path / 'gap'}"])
-    assert main() == 0
+    assert refuse(tmp_path, "gap", "next", "logs=.", "out=gap").returncode == 0
     assert given == ["walk"]
 
 
@@ -403,7 +403,8 @@ def test_the_file_plays_back_through_record(tmp_path: Path) -> None:
     assert here.limits.allow(played.used)
     file = write(played, JOINTS, here.period, tmp_path / "next.csv")
     gains = f"gains=[[{played.kp[0]:g},{played.kd[0]:g}]]"
-    again = playback_recorded(file, [gains, "hang=[[0,0.26]]", "seconds=2", "physics_dt=0.001"])
+    excitation = f"excitation=[{{playback: {{file: {file}}}}}]"
+    _, (again,) = recorded([excitation, gains, "hang=[[0,0.26]]", "seconds=2", "physics_dt=0.001"])
     np.testing.assert_allclose(again.joint("q_target"), played.motion.target, atol=2e-5)
     np.testing.assert_allclose(again.joint("q"), played.q, atol=0.01)
     assert np.sqrt(np.mean((again.joint("q") - played.q) ** 2)) < 0.002
@@ -412,23 +413,6 @@ def test_the_file_plays_back_through_record(tmp_path: Path) -> None:
     header = file.read_text().splitlines()[0].split(",")
     assert header[:2] == ["t", "q_target_FR_hip"]
     assert {"kp_FR_hip", "kd_RL_calf", "torque_enable"} <= set(header)
-
-
-def playback_recorded(file: Path, overrides: Sequence[str]) -> Recording:
-    from go1exp.cli.app import parse
-    from go1exp.cli.record import RIG, RecordSettings, _motions
-    from go1exp.config.compose import compose
-    from go1exp.logs.record import plan, simulate
-    from go1exp.sim.task import parse_parts
-
-    container = compose("record", ["backend.threads=1", f"excitation=[{{playback: {{file: {file}}}}}]", *overrides])
-    parts, _ = parse_parts(container, RIG)
-    settings = parse(
-        RecordSettings, {k: v for k, v in container.items() if k not in (*RIG, "excitation", "controller")}
-    )
-    rig = simulate.Rig(**parts, physics_dt=settings.physics_dt)
-    (episode,) = plan.episodes(_motions(container["excitation"]), settings)
-    return simulate.play(rig, [episode], settings.sensors, 0, lambda done, total: None)[0]
 
 
 def _file(folder: Path, *, joints: Sequence[str] = JOINTS, rows: int = 50, **columns: Any) -> Path:
@@ -474,36 +458,25 @@ def test_playback_says_what_is_wrong_with_a_file(tmp_path: Path, make: Any, comp
 
 
 @pytest.mark.slow("go1exp/gap/", "go1exp/cli/gap_next.py", "conf/gap_next.yaml", "tests/")
-def test_next_as_a_user_runs_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
-    monkeypatch.chdir(tmp_path)
-
-    def run(*words: str) -> int:
-        monkeypatch.setattr("sys.argv", ["go1exp", *words])
-        return main()
-
+def test_next_as_a_user_runs_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     kinds = "excitation=[multisine,gait]"
     (tmp_path / "hidden.yaml").write_text("kd_scale: {scale: 1.7}\n")
-    assert run("record", kinds, "seeds=[0,1,2]", "seconds=4", "effect=hidden.yaml", "backend.threads=1", "out=r") == 0
+    words = [kinds, "seeds=[0,1,2]", "seconds=4", "effect=hidden.yaml", "backend.threads=1", "out=r"]
+    assert refuse(tmp_path, "record", *words).returncode == 0
     search = ["search.bootstraps=5", "search.shortlist=3", "search.threads=1"]
-    assert run("gap", "explain", "logs=r", "out=g", *search) in (10, 11), capsys.readouterr().err
-    capsys.readouterr()
+    explained = refuse(tmp_path, "gap", "explain", "logs=r", "out=g", *search)
+    assert explained.returncode in (10, 11), explained.stderr
+    monkeypatch.setattr("go1exp.gap.design.plan.MOTIONS", (("multisine", {}), ("gait", {})))
     for gains, status in (("[[1,1],[1,2]]", 0), ("[[1,1]]", 16)):
         limits = ["design.designs=12", "design.refine=0", "design.hang=[[0,0]]", "design.seconds=4"]
-        monkeypatch.setattr("go1exp.gap.design.plan.MOTIONS", (("multisine", {}), ("gait", {})))
-        assert run("gap", "next", "logs=r", "out=g", f"design.gains={gains}", *limits) == status
-        said = capsys.readouterr().out
+        done = refuse(tmp_path, "gap", "next", "logs=r", "out=g", f"design.gains={gains}", *limits)
+        assert done.returncode == status
         found = json.loads((tmp_path / "g/next.json").read_text())
         assert (tmp_path / "g/next.csv").exists() == (status == 0)
         if status == 0:
-            assert "record next" in said
+            assert "record next" in done.stdout
             assert found["design"]["kd"][0] > 0.6
             assert found["pairs"][0]["after"]["power"] > ENOUGH > found["pairs"][0]["before"]["power"]
         else:
-            assert "not separable" in said
-            assert "gains and hang may not change" in said
-
-
-def test_a_layout_has_one_unknown_for_a_tilt(arm: FixedBase) -> None:
-    """What the arm's tests rest on: its base has the name that a tilt looks for."""
-    probes = tolerances.probes(arm, [("base_tilt", "pitch")], {})
-    assert Layout.from_probes(arm, probes).size == 1
+            assert "not separable" in done.stdout
+            assert "gains and hang may not change" in done.stdout

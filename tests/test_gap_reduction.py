@@ -1,4 +1,4 @@
-"""Fewer and simpler terms (``go1exp/gap/search/reduction.py``), on models whose error is known."""
+"""Fewer and simpler terms, at which joints, under which name: on models whose error is known."""
 
 from __future__ import annotations
 
@@ -12,8 +12,12 @@ import pytest
 
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import Candidate
-from go1exp.gap.search import reduction, tolerances
+from go1exp.gap.score.linear import Layout
+from go1exp.gap.search import candidates, reduction, thresholds, tolerances
+from go1exp.gap.search.candidates import _choice
+from go1exp.gap.search.screen import Motion, Screened, Variant, library, rivals
 from go1exp.gap.search.state import Search
+from go1exp.gap.search.tolerances import Freedom
 from go1exp.robot import JOINTS
 from go1exp.sim.effects.tolerances import DECLARED
 
@@ -155,3 +159,261 @@ def test_a_term_is_kept_to_the_fewest_joints_that_held_out_windows_allow(
     asked = reduction.concentrate(asked, "link_mass")
     assert {3, 4, 5} - {j for _, j in asked.state.kept} == joints
     assert bool(asked.steps) == (joints == {5})
+
+
+# ---------------------------------------------------------------------- which joints
+
+
+LEGS = tuple(tuple(range(3 * leg, 3 * leg + 3)) for leg in range(4))
+MACHINE: Any = SimpleNamespace(
+    joints=JOINTS, groups=LEGS, base_probe=(), on_ground=False, tolerances=DECLARED, effort=(23.7, 23.7, 35.55) * 4
+)
+
+
+@dataclass
+class Quadratic:
+    """A linear model whose chi2 is known: every joint that is kept within its tolerance costs ``cost`` (12,)."""
+
+    theta: Theta
+    cost: np.ndarray
+    gain: np.ndarray
+    may: Freedom = field(default_factory=lambda: Freedom(DECLARED))
+    machine: Any = field(default_factory=lambda: MACHINE)
+
+    def price(self, kept: frozenset[tuple[str, int]]) -> float:
+        return float(sum(self.cost[j] for _, j in kept))
+
+    def held_out(self, kept: frozenset[tuple[str, int]]) -> np.ndarray:
+        worse = np.zeros((40, 4))
+        for _, j in kept:
+            worse[:, j // 3] += self.gain[j] + 0.05 * np.random.default_rng(j).standard_normal(40)
+        return worse
+
+
+def at(cost: np.ndarray, gain: np.ndarray | None = None) -> set[str]:
+    theta = {("link_mass", "scale"): np.full(12, 1.6)}
+    linear: Any = Quadratic(theta, cost, 0.01 * cost if gain is None else gain)
+    inside = reduction.chosen(linear, "link_mass", frozenset(), np.random.default_rng(0))
+    return {JOINTS[j] for j in inside}
+
+
+def test_one_loaded_link_is_one_joint_though_all_were_free() -> None:
+    cost = np.full(12, 4.0)
+    cost[5] = 900.0
+    assert at(cost) == {JOINTS[5]}
+
+
+def test_an_effect_that_is_everywhere_is_named_everywhere() -> None:
+    assert at(np.full(12, 300.0)) == set(JOINTS)
+
+
+def test_a_part_of_the_robot_is_found_as_one() -> None:
+    cost = np.tile([3.0, 3.0, 250.0], 4)
+    assert at(cost) == {j for j in JOINTS if j.endswith("calf")}
+
+
+def test_a_joint_that_held_out_windows_do_not_miss_is_left_out() -> None:
+    """It pays on the windows of the fit, by 2 % of what the loaded link brings, and nowhere else."""
+    cost, gain = np.full(12, 1.0), np.zeros(12)
+    cost[[5, 8]], gain[5] = (900.0, 18.0), 0.5
+    assert at(cost, gain) == {JOINTS[5]}
+    gain[8] = 0.5
+    assert at(cost, gain) == {JOINTS[5], JOINTS[8]}
+
+
+def test_fewer_joints_that_lose_little_are_to_be_fitted_the_fewest_first() -> None:
+    """One calf brings most, with its leg nearly all; all calves and a side are the best of four and of six."""
+    cost = np.full(12, 1.0)
+    cost[[3, 4, 5]] = 20.0, 120.0, 260.0
+    linear: Any = Quadratic({("link_mass", "scale"): np.full(12, 1.6)}, cost, np.zeros(12))
+    sets = [{5}, {3, 4, 5}, {2, 5, 8, 11}, {3, 4, 5, 9, 10, 11}]
+    assert reduction.fewer(linear, "link_mass", frozenset()) == sets
+    linear.theta = {("link_mass", "scale"): np.where(np.arange(12) == 5, 1.6, 1.05)}
+    assert reduction.fewer(linear, "link_mass", frozenset()) == []  # the others are within their tolerance
+
+
+def test_a_value_on_its_tolerance_is_not_beyond_it() -> None:
+    """A value that is clipped to 1 + 0.05 is 0.05 and 4e-17 away from 1."""
+    p = DECLARED.param(("link_mass", "scale"))
+    on, beyond = (np.full(12, p.null + far * p.tolerance) for far in (1.0, 1.001))
+    assert abs(on[0] - p.null) > p.tolerance
+    assert not candidates.beyond("link_mass", {("link_mass", "scale"): on}, JOINTS, DECLARED).any()
+    assert candidates.beyond("link_mass", {("link_mass", "scale"): beyond}, JOINTS, DECLARED).all()
+
+
+def test_joints_that_are_within_their_tolerance_are_not_asked() -> None:
+    scale = np.ones(12)
+    scale[3] = 2.0
+    linear: Any = Quadratic({("link_mass", "scale"): scale}, np.full(12, 500.0), np.zeros(12))
+    assert reduction.chosen(linear, "link_mass", frozenset(), np.random.default_rng(0)) == {3}
+
+
+def test_pieces_are_joints_parts_legs_sides_and_all() -> None:
+    sets = {frozenset(JOINTS[j] for j in piece) for piece in reduction.pieces(JOINTS)}
+    assert len(sets) == 12 + 3 + 4 + 4 + 1
+    assert frozenset(j for j in JOINTS if j[1] == "R") in sets  # the right side
+    assert reduction.pieces(["shoulder", "elbow"]) == [frozenset([0]), frozenset([1]), frozenset([0, 1])]
+
+
+# ---------------------------------------------------------------------- names
+
+
+def test_a_tilt_is_simpler_than_the_twelve_offsets_that_imitate_it() -> None:
+    offsets = {("encoder_offset", "offset"): np.full(12, 0.02)}
+    tilt = {("base_tilt", "roll"): np.array([0.03]), ("base_tilt", "pitch"): np.array([-0.02])}
+    values = [("encoder_offset", offsets), ("base_tilt", tilt)]
+    numbers = np.array([(candidates.count(name, theta, MACHINE), len(theta)) for name, theta in values], dtype=float)
+    gain = np.random.default_rng(0).normal(2.0, 0.1, (2, 60))
+    gain[1] = gain[0] - 0.01  # half a per cent less: the same
+    all_out, none = np.ones(2, dtype=bool), np.zeros(2, dtype=bool)
+    chosen, alias, aside = _choice(gain, all_out, none, numbers, none, np.random.default_rng(0))
+    assert chosen == 1
+    np.testing.assert_array_equal((alias, aside), ([False, True], [True, False]))
+    gain[1] = 0.8 * gain[0]  # but it must explain as much
+    assert _choice(gain, all_out, none, numbers, none, np.random.default_rng(0))[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("gains", "numbers", "chosen"),
+    [
+        ((0.523, 0.512), (8.0, 4.0), 1),  # the same: fewer joints come first
+        ((0.523, 0.512), (4.0, 4.0), 0),  # as many: the better one
+        ((0.523, 0.490), (8.0, 4.0), 0),  # an equal that does not mean the same
+    ],
+)
+def test_of_equals_that_mean_the_same_the_one_at_fewer_joints_comes_first(
+    gains: tuple[float, float], numbers: tuple[float, float], chosen: int
+) -> None:
+    gain = np.array(gains)[:, None] + np.random.default_rng(0).normal(0.0, 0.2, (2, 60))
+    gain += np.array(gains)[:, None] - gain.mean(axis=1, keepdims=True)
+    all_out, none = np.ones(2, dtype=bool), np.zeros(2, dtype=bool)
+    counts = np.array([(count, 1.0) for count in numbers])
+    first, alias, aside = _choice(gain, all_out, none, counts, none, np.random.default_rng(0))
+    assert first == chosen
+    np.testing.assert_array_equal((alias, aside), ([True, True], [False, False]))
+
+
+@pytest.mark.parametrize(
+    ("gains", "numbers", "chosen", "alias"),
+    [
+        ((0.11, 0.12), ((8.0, 1.0), (5.0, 4.0)), 1, (True, True)),  # a load at fewer links, masses at more: a set
+        ((0.11, 0.12), ((1.0, 1.0), (1.0, 4.0)), 0, (True, True)),  # as many: fewer parameters come first
+        ((0.11, 0.25), ((1.0, 1.0), (5.0, 4.0)), 1, (False, True)),  # clearly better
+        ((0.25, 0.11), ((8.0, 1.0), (5.0, 4.0)), 0, (True, False)),  # clearly worse
+    ],
+)
+def test_where_the_gap_is_small_what_is_easily_taken_for_another_is_named_with_it(
+    gains: tuple[float, float], numbers: tuple[tuple[float, float], ...], chosen: int, alias: tuple[bool, bool]
+) -> None:
+    noise = np.random.default_rng(0).normal(0.0, 0.01, 60)
+    gain = np.array(gains)[:, None] + noise
+    all_out, none, second = np.ones(2, dtype=bool), np.zeros(2, dtype=bool), np.array([False, True])
+    found = _choice(gain, all_out, none, np.array(numbers), second, np.random.default_rng(0))
+    assert found[0] == chosen
+    np.testing.assert_array_equal(found[1], alias)
+
+
+def test_what_one_that_strains_is_easily_taken_for_is_tried_in_the_way_that_relieves_most() -> None:
+    def way(effect: str, relief: float, **shape: float) -> Screened:
+        shapes = {(effect, name): np.array([value]) for name, value in shape.items()}
+        return Screened(Variant(effect, (), shapes), {}, 0.1, relief, 1.0)
+
+    ways = [way("point_load", 0.05, z=0.1), way("link_mass", 0.07), way("point_load", 0.11, z=-0.2)]
+    ways += [way("soft_mount", 0.02), way("cogging", 0.2), way("encoder_offset", 0.2), way("link_com", 0.09)]
+    nominal = ("link_mass", "link_com", "encoder_offset")
+    (found,) = rivals(ways, ["link_com", "link_mass"], nominal)
+    assert found is ways[2]  # a soft mount relieves too little, cogging is not taken for a mass
+    assert rivals(ways, ["viscous"], nominal) == []
+
+
+@pytest.mark.parametrize("demand", [0.2, 0.5, 1.4])
+def test_a_limit_of_the_torque_is_looked_for_below_what_was_asked_for(demand: float) -> None:
+    """A limit of 0.9 of the peak does nothing in recordings that ask for a fifth of it."""
+    asked = np.tile([0.3, demand, 0.1], 4)
+    motion = Motion(np.zeros(12), -np.ones(12), np.ones(12), asked)
+    probes = [p for v in library(MACHINE, motion) if v.effect == "torque_speed_limit" for p in v.probes]
+    peaks = [1.0 + p.delta for p in probes if p.key == ("torque_speed_limit", "peak")]
+    thighs = [peak[1] for peak in peaks if (peak < 1.0).sum() == 4 and peak[1] < 1.0]  # part by part
+    assert len(thighs) == len(thresholds.TORQUE_SHARES)
+    assert len({p for p in thighs if p < max(min(demand, 1.0), 0.2) + 1e-9}) >= (4 if demand > 1.0 else 1)
+    assert max(thighs) <= 0.95 + 1e-9
+
+
+def test_what_shares_a_value_moves_only_where_it_is() -> None:
+    """A limit at the four thighs: a step of the fit must not pull the other joints along."""
+    key = ("torque_speed_limit", "peak")
+    theta = {key: np.tile([1.0, 0.7, 1.0], 4)}
+    (probe,) = tolerances.probes(MACHINE, [key], theta)
+    assert set(np.flatnonzero(probe.delta)) == {1, 4, 7, 10}
+    layout = Layout.from_probes(MACHINE, [probe])
+    after = tolerances.moved(theta, layout, [probe], np.array([-0.1]), MACHINE)[key]
+    np.testing.assert_allclose(after, np.tile([1.0, 0.6, 1.0], 4))
+    limits = tolerances.bounds(layout, [probe], theta, Freedom(DECLARED).also("torque_speed_limit"))
+    np.testing.assert_allclose((limits.low, limits.high), ([-0.5], [0.3]))
+    nowhere = tolerances.probes(MACHINE, [key], {})[0]
+    assert np.all(nowhere.delta != 0.0)
+
+
+def test_a_shape_moves_only_where_its_effect_leaves_its_tolerance() -> None:
+    """The place of a load of 5 g, of which 10 g are tolerated, means next to nothing and would go anywhere."""
+    mass = np.zeros(12)
+    mass[[2, 5]] = 0.1, 0.005
+    theta = {("point_load", "mass"): mass}
+    columns = tolerances.probes(MACHINE, [("point_load", "mass"), ("point_load", "z")], theta)
+    layout = Layout.from_probes(MACHINE, columns)
+    limits = tolerances.bounds(layout, columns, theta, Freedom(DECLARED).also("point_load"))
+    by_key = {
+        name: {
+            int(layout.joint[i]): (limits.low[i], limits.high[i]) for i in range(layout.size) if layout.probe[i] in at
+        }
+        for name, at in (("mass", (0, 1, 2)), ("z", (3, 4, 5)))
+    }
+    assert by_key["z"][2] == pytest.approx((-0.187, 0.613))
+    assert all(by_key["z"][j] == (0.0, 0.0) for j in range(12) if j != 2)
+    assert all(high > 0.5 for _, high in by_key["mass"].values())
+
+
+def test_a_spring_is_looked_for_at_rest_angles_of_the_whole_range() -> None:
+    motion = Motion(np.zeros(12), np.full(12, -0.7), np.full(12, 0.4), np.ones(12))
+    rests = [
+        v.shapes["parallel_stiffness", "rest"] for v in library(MACHINE, motion) if v.effect == "parallel_stiffness"
+    ]
+    np.testing.assert_allclose(sorted(float(r[0]) for r in rests), [-0.7, 0.0, 0.4])
+
+
+@dataclass
+class Settled:
+    """A fitted state with one term, whose chi2 on held-out windows is known."""
+
+    terms: tuple[str, ...]
+    chi2: float
+    value: float
+    others: dict[str, tuple[float, float]] = field(default_factory=dict)
+    tolerances: Any = DECLARED
+
+    @property
+    def theta(self) -> Theta:
+        return {("link_mass", "scale"): np.full(12, self.value), ("armature", "added"): np.full(12, self.value - 1.0)}
+
+    def without(self, name: str, instead: str) -> Settled:
+        assert (name,) == self.terms
+        return Settled((instead,), *self.others[instead])
+
+    def converged(self, steps: int) -> Settled:
+        return self
+
+    def held_out(self, theta: Theta | None = None) -> np.ndarray:
+        noise = np.random.default_rng(0).normal(0.0, 0.02, (40, 4))
+        return np.exp(noise) * (10.0 if theta is not None else self.chi2)
+
+
+def test_equals_of_a_term_that_is_replaced_stay_equals_if_they_do_as_well_as_what_replaces_it() -> None:
+    state = Settled(("point_load",), 1.0, 1.0, {"link_mass": (1.001, 1.4), "armature": (1.5, 1.1)})
+    aliases = {"point_load": ("point_load", "link_mass", "armature")}
+    search: Any = SimpleNamespace(state=state, aliases=aliases, nominal={}, rng=np.random.default_rng(0))
+    rest: Any = Settled(("link_com",), 1.0, 1.0)
+    assert reduction.still_equal(search, "point_load", "link_com", rest) == ("link_mass",)
+    state.others["link_mass"] = (1.001, 1.04)  # within its tolerance: it would not be missing
+    assert reduction.still_equal(search, "point_load", "link_com", rest) == ()
+    search.aliases = {}
+    assert reduction.still_equal(search, "point_load", "link_com", rest) == ()

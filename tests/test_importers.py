@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,14 +12,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from go1exp.base.paths import data_root
 from go1exp.config.schema.registry import ConfigError, members
 from go1exp.logs import recording
 from go1exp.logs.importers import import_recordings
 from go1exp.logs.recording import Recording, RecordingError
 from go1exp.robot import JOINT_POS_LIMITS, JOINTS, NOMINAL_STANCE
-
-DATA = Path(os.environ.get("GO1EXP_DATA", data_root().parent / "shared/data"))
+from tests.made import real
 
 COUNTS = {
     "go2_in_air": 1,
@@ -34,13 +31,11 @@ COUNTS = {
 
 def imported(name: str, **options: Any) -> list[Recording]:
     """All recordings of a real source."""
-    if not (DATA / name).is_dir():
-        pytest.skip(f"the recordings of {name} are not here; GO1EXP_DATA names their folder")
-    return import_recordings(name, DATA / name, options)
+    return import_recordings(name, real(name), options)
 
 
 def raw(name: str, episode_file: str) -> dict[str, np.ndarray]:
-    with np.load(DATA / name / episode_file) as file:
+    with np.load(real(name) / episode_file) as file:
         return {key: file[key] for key in file.files}
 
 
@@ -155,7 +150,7 @@ def test_so101_moves_by_whole_steps_and_the_jaw_is_left_out() -> None:
         assert 35 < r.t[-1] < 206
         assert multiples(r.joint("q"), 2 * np.pi / 4096, 1e-4)
         assert "Jaw" not in "".join(r.channels)
-    (r,) = import_recordings("so101_arm", DATA / "so101_arm/sinusoidal_sweep.npz", {"base_quat": [0, 1, 0, 0]})
+    (r,) = import_recordings("so101_arm", real("so101_arm/sinusoidal_sweep.npz"), {"base_quat": [0, 1, 0, 0]})
     source = raw("so101_arm", "sinusoidal_sweep.npz")
     assert r.meta.base_quat == (0, 1, 0, 0)
     assert np.array_equal(r.joint("q_target"), source["cmd_pos"][:, :5])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,37 +15,22 @@ from scipy.spatial.transform import Rotation
 import go1exp.logs.excitations
 import go1exp.logs.record.motions  # noqa: F401  (registers every excitation)
 from go1exp import robot
-from go1exp.cli import main
 from go1exp.cli.app import parse
-from go1exp.cli.record import RIG, RecordSettings
-from go1exp.config.compose import compose
-from go1exp.config.schema.registry import ConfigError, bind
+from go1exp.cli.record import RecordSettings
+from go1exp.config.schema.registry import ConfigError
 from go1exp.logs.audit import audit
-from go1exp.logs.record import plan, simulate
+from go1exp.logs.record import simulate
 from go1exp.logs.record.sensors import Channel, SensorConfig
 from go1exp.logs.recording import Recording, read_folder
-from go1exp.sim.task import parse_parts
+from tests.command import refuse
+from tests.laboratory import ordered, recorded
 
 Make = Callable[..., list[Recording]]
 NOISELESS = [f"sensors.{name}={{noise: 0.0, step: 0.0}}" for name in ("q", "qd", "tau_est", "gyro", "acc", "attitude")]
 
 
-def settings_and_rig(*overrides: str) -> tuple[RecordSettings, simulate.Rig, list[Any]]:
-    container = compose("record", ["backend.threads=1", "physics_dt=0.001", *overrides])
-    parts, problems = parse_parts(container, RIG)
-    assert problems == []
-    terms = [bind("excitation", name, {}, name)[0] for name in container["excitation"]]
-    rest = {k: v for k, v in container.items() if k not in (*RIG, "excitation")}
-    settings = parse(RecordSettings, rest)
-    return settings, simulate.Rig(**parts, physics_dt=settings.physics_dt), terms
-
-
 def make(*overrides: str) -> list[Recording]:
-    settings, rig, terms = settings_and_rig(*overrides)
-    result = simulate.play(
-        rig, plan.episodes(terms, settings), settings.sensors, settings.seed, lambda done, total: None
-    )
-    return result
+    return list(recorded(["physics_dt=0.001", *overrides])[1])
 
 
 @pytest.fixture(scope="module")
@@ -190,29 +174,36 @@ def test_all_recordings_of_a_set_are_of_one_robot_even_if_robots_differ() -> Non
     assert np.abs(other[0].joint("tau_est").mean(0) - torques[0]).max() > 0.01
 
 
-def test_recordings_of_one_name_and_folders_that_cannot_be_written_are_refused(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["excitation=[chirpy]"], "excitation.chirpy: unknown excitation term 'chirpy'; did you mean 'chirp'?"),
+        (["excitation=chirp"], "excitation = 'chirp': must be a list"),
+        (["excitation=[{chirp: {band: [3.0, 1.0]}}]"], "excitation.chirp.band"),
+        (["physics_dt=0.0015"], "physics_dt = 0.0015: 1 / sensors.rate_hz = 0.002 must be a multiple of it"),
+        (["gains=[]"], "gains = []: at least one is needed"),
+        (["gains=[[1e9,1.0]]"], "gains.0.0 = 1000000000.0: input should be less than or equal to 1023"),
+        (["excitation=[policy]"], "run: required for excitation=[policy]"),
+        (["support=ground"], "chirp is for a robot that is suspended"),
+        (["effect=nope.yaml"], "effect=nope.yaml: no such file"),
+        (["sensors.q.noise=-1"], "sensors.q.noise = -1"),
+        (["seeds=[0,0]"], "chirp_kp20_kd0.5_0: two recordings of this name"),
+        (["out=file"], "out = 'file': cannot be written to"),
+        (["excitation=[policy]", "run=nowhere", "repeats=2"], "are for motions"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused(arguments: list[str], message: str, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    cases = {
-        ("seeds=[0,0]", f"out={tmp_path / 'a'}"): "chirp_kp20_kd0.5_0: two recordings of this name",
-        (f"out={tmp_path / 'file'}",): f"out = '{tmp_path / 'file'}': cannot be written to",
-        ("excitation=[policy]", "run=nowhere", "repeats=2", f"out={tmp_path / 'a'}"): "are for motions",
-    }
-    for arguments, message in cases.items():
-        sys.argv = ["go1exp", "record", "seconds=0.2", *arguments]
-        assert main() == 2, arguments
-        assert message in capsys.readouterr().err
+    done = refuse(tmp_path, "record", "seconds=0.2", "out=new", *arguments)
+    assert (done.returncode, message in done.stderr) == (2, True), done.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
 def test_a_hidden_effect_moves_the_robot_and_leaves_no_name_in_the_file(tmp_path: Path) -> None:
-    arguments = ["record", "excitation=[slow_ramps]", "seconds=2.0", "physics_dt=0.001"]
-    for name, extra in (
-        ("with", ["effect=[coulomb,encoder_offset]", "effect.encoder_offset.offset=0.03"]),
-        ("without", []),
-    ):
-        sys.argv = ["go1exp", *arguments, *extra, f"out={tmp_path / name}"]
-        assert main() == 0
+    words = ["record", "excitation=[slow_ramps]", "seconds=2.0", "physics_dt=0.001"]
+    effects = ["effect=[coulomb,encoder_offset]", "effect.encoder_offset.offset=0.03"]
+    assert refuse(tmp_path, *words, *effects, "out=with").returncode == 0
+    assert refuse(tmp_path, *words, "out=without").returncode == 0
     (file,) = (tmp_path / "with").iterdir()
     (hidden,), (plain,) = read_folder(tmp_path / "with"), read_folder(tmp_path / "without")
     assert np.abs(hidden.joint("q") - plain.joint("q")).max() > 0.01
@@ -249,7 +240,7 @@ def test_the_same_seeds_give_the_same_files_and_others_do_not() -> None:
 
 
 def test_a_policy_is_recorded_until_it_falls(make_task: Callable[..., Any]) -> None:
-    settings, rig, _ = settings_and_rig("sensors.truth=true")
+    settings, rig, _ = ordered(["physics_dt=0.001", "sensors.truth=true"])
     trained = make_task("backend.threads=1")
 
     def policy(observation: torch.Tensor) -> torch.Tensor:
@@ -269,7 +260,7 @@ def test_a_policy_is_recorded_until_it_falls(make_task: Callable[..., Any]) -> N
 
 
 def test_a_hung_robot_can_tread_the_air_under_a_policy(make_task: Callable[..., Any]) -> None:
-    settings, rig, _ = settings_and_rig()
+    settings, rig, _ = ordered(["physics_dt=0.001"])
     observations: list[torch.Tensor] = []
 
     def policy(observation: torch.Tensor) -> torch.Tensor:
@@ -287,43 +278,19 @@ def test_a_hung_robot_can_tread_the_air_under_a_policy(make_task: Callable[..., 
         np.testing.assert_allclose(observation[0, :9], expected, atol=1e-6)
 
 
-def test_settings_that_do_not_fit_are_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    cases = {
-        ("excitation=[chirpy]",): "excitation.chirpy: unknown excitation term 'chirpy'; did you mean 'chirp'?",
-        ("excitation=chirp",): "excitation = 'chirp': must be a list",
-        ("excitation=[{chirp: {band: [3.0, 1.0]}}]",): "excitation.chirp.band",
-        ("physics_dt=0.0015",): "physics_dt = 0.0015: 1 / sensors.rate_hz = 0.002 must be a multiple of it",
-        ("gains=[]",): "gains = []: at least one is needed",
-        ("gains=[[1e9,1.0]]",): "gains.0.0 = 1000000000.0: input should be less than or equal to 1023",
-        ("excitation=[policy]",): "run: required for excitation=[policy]",
-        ("support=ground",): "chirp is for a robot that is suspended",
-        ("effect=nope.yaml",): "effect=nope.yaml: no such file",
-        ("sensors.q.noise=-1",): "sensors.q.noise = -1",
-    }
-    for arguments, message in cases.items():
-        sys.argv = ["go1exp", "record", *arguments, f"out={tmp_path / 'none'}"]
-        assert main() == 2, arguments
-        assert message in capsys.readouterr().err, arguments
-    assert not (tmp_path / "none").exists()
-
-
-def test_a_recording_can_be_audited_and_a_damaged_one_is_named(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    sys.argv = ["go1exp", "record", "excitation=[multisine]", "seconds=2.0", "physics_dt=0.001", f"out={tmp_path}"]
-    assert main() == 0
+def test_a_recording_can_be_audited_and_a_damaged_one_is_named(tmp_path: Path) -> None:
+    words = ["excitation=[multisine]", "seconds=2.0", "physics_dt=0.001", "out=."]
+    assert refuse(tmp_path, "record", *words).returncode == 0
     (file,) = tmp_path.glob("*.parquet")
-    sys.argv = ["go1exp", "record", "audit", str(file), f"out={tmp_path / 'audit.json'}"]
-    assert main() in (0, 3)
+    done = refuse(tmp_path, "record", "audit", file.name, "out=audit.json")
+    assert done.returncode in (0, 3)
     assert "q_FR_hip" in (tmp_path / "audit.json").read_text()
-    assert file.name in capsys.readouterr().out
-    damaged = tmp_path / "another.parquet"
-    damaged.write_bytes(file.read_bytes()[:2000])
-    sys.argv = ["go1exp", "record", "audit", str(tmp_path)]
-    assert main() == 1
-    output = capsys.readouterr()
-    assert f"{damaged}: not a whole Parquet file" in output.err
-    assert file.name in output.out  # the other one is judged all the same
+    assert file.name in done.stdout
+    (tmp_path / "another.parquet").write_bytes(file.read_bytes()[:2000])
+    done = refuse(tmp_path, "record", "audit", ".")
+    assert done.returncode == 1
+    assert "another.parquet: not a whole Parquet file" in done.stderr
+    assert file.name in done.stdout  # the other one is judged all the same
 
 
 def test_channels_without_noise_or_steps_are_left_as_they_are() -> None:
