@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shlex
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,7 +14,6 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from go1exp.base.wording import NOT_FOR_TRAINING
-from go1exp.cli import main
 from go1exp.cli.hydra_main import choices_from_files
 from go1exp.cli.places import remove_empty
 from go1exp.cli.verbs import command, protected
@@ -27,21 +25,20 @@ from go1exp.gap.result import GapSettings
 from go1exp.logs import recording
 from go1exp.logs.recording import Recording, RecordingError
 from go1exp.robot import JOINTS
+from tests.command import refuse
 from tests.made import meta
 
 Run = Callable[..., tuple[int, str]]
 
 
 @pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     """Types a command line in a folder of its own, in this process; gives the status and what was complained of."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
 
     def type_in(*words: str) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["go1exp", *words])
-        status = main()
-        return status, capsys.readouterr().err
+        done = refuse(tmp_path, *words)
+        return done.returncode, done.stderr
 
     return type_in
 
@@ -177,22 +174,18 @@ def test_gap_leaves_out_recordings_that_are_too_short(run: Run, tmp_path: Path) 
         assert run("gap", stage, "logs=logs") == (14, "go1exp gap: none of these recordings can be compared\n")
 
 
-def test_a_fit_of_several_sets_of_gains_says_which_there_are_and_leaves_no_folder(run: Run, tmp_path: Path) -> None:
-    for kp in (20.0, 35.0):
-        for k in range(3):
-            made(tmp_path / "logs", f"kp{kp:g}_{k}", rows=50, kp=kp)
-    status, text = run("fit-actuator", "recordings=logs", "out=nets/mine")
-    assert status == 1
-    assert "kp 20, kd 0.5 (3), kp 35, kd 0.5 (3); choose one, as gains=[20,0.5]" in text
-    said = "go1exp fit-actuator: gains = [35,1]: no recording was made with these; there are [20,0.5], [35,0.5]\n"
-    assert run("fit-actuator", "recordings=logs", "gains=[35,1]", "out=nets/mine") == (2, said)
-    assert not (tmp_path / "nets").exists()
-
-
-def test_of_several_sets_of_gains_a_fit_takes_the_one_that_is_chosen(run: Run, tmp_path: Path) -> None:
+def test_of_several_sets_of_gains_a_fit_takes_the_one_that_is_chosen_or_says_which_there_are(
+    run: Run, tmp_path: Path
+) -> None:
     for kp in (20.0, 35.0):
         for k in range(4):
             made(tmp_path / "logs", f"kp{kp:g}_{k}", rows=60, kp=kp)
+    status, text = run("fit-actuator", "recordings=logs", "out=nets/mine")
+    assert status == 1
+    assert "kp 20, kd 0.5 (4), kp 35, kd 0.5 (4); choose one, as gains=[20,0.5]" in text
+    said = "go1exp fit-actuator: gains = [35,1]: no recording was made with these; there are [20,0.5], [35,0.5]\n"
+    assert run("fit-actuator", "recordings=logs", "gains=[35,1]", "out=nets/mine") == (2, said)
+    assert not (tmp_path / "nets").exists()
     small = ("hidden=[4]", "epochs=1", "half_net=false", "plots=false", "share=all")
     status, text = run("fit-actuator", "recordings=logs", "gains=[35,0.5]", "out=nets/mine", *small)
     assert status == 0, text
@@ -211,22 +204,8 @@ def test_only_empty_folders_are_taken_away(tmp_path: Path) -> None:
 # ---------------------------------------------------------------------- paths
 
 NAMES = (
-    "a b",
-    "a=b",
-    "it's",
-    "a#b",
-    "é",
-    "(x)",
-    "1_000",
-    "2026",
-    "$x",
-    "a{b",
-    "a&b",
-    "a;b",
-    "a!b",
-    "a\\",
-    "x(1)/y",
-    "~/x",
+    *("a b", "a=b", "it's", "a#b", "é", "(x)", "1_000", "2026", "$x"),
+    *("a{b", "a&b", "a;b", "a!b", "a\\", "x(1)/y", "~/x"),
 )
 
 
@@ -236,20 +215,13 @@ def test_hydra_takes_a_path_as_it_is(name: str) -> None:
         assert OverridesParser.create().parse_override(protected(f"{key}={name}")).value() == name
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "run=null",
-        "run=a,b",
-        "run='a b'",
-        "files=[a,b]",
-        "out=${x}",
-        "seed=1 2",
-        "run=glob(*)",
-        "options={a: 1}",
-        "command=gentle",
-    ],
+MEANT = (
+    *("run=null", "run=a,b", "run='a b'", "files=[a,b]", "out=${x}", "seed=1 2"),
+    *("run=glob(*)", "options={a: 1}", "command=gentle"),
 )
+
+
+@pytest.mark.parametrize("text", MEANT)
 def test_what_is_meant_for_hydra_stays(text: str) -> None:
     assert protected(text) == text
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import zipfile
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -133,10 +134,7 @@ def test_rows_over_gaps_and_with_drives_off_are_left_out(recordings: list[Record
         inside = (t >= stamp - 0.01 - 1e-6) & (t <= stamp)
         assert on[inside].all()
         assert not (stamp - 0.01 < t[499] + 0.19 and stamp > t[499])
-    assert t[298] in stamps
-    assert t[499] in stamps
-    assert t[310] in stamps
-    assert t[504] in stamps
+    assert {t[298], t[310], t[499], t[504]} <= set(stamps)
 
 
 def test_a_missing_channel_is_named(recordings: list[Recording]) -> None:
@@ -168,11 +166,7 @@ def test_joint_torque_replaces_the_reported_one(recordings: list[Recording]) -> 
 
 def test_episodes_are_split_whole_and_repeats_stay_together() -> None:
     made = [drive(f"e{i}", i, 0.2) for i in range(8)]
-    made += [
-        drive("r0", 9, 0.2, repeat_of="e0"),
-        drive("r1", 9, 0.2, repeat_of="r0"),
-        drive("x", 9, 0.2, repeat_of="y"),
-    ]
+    made += [drive(name, 9, 0.2, repeat_of=other) for name, other in (("r0", "e0"), ("r1", "r0"), ("x", "y"))]
     drawn = set()
     for seed in range(8):
         parts = split(made, 0.25, 0.25, seed)
@@ -261,29 +255,23 @@ def test_the_net_beats_every_reference_on_a_drive_that_lags_and_saturates(result
     assert cell.rmse["net"] < 0.6 * cell.rmse["linear"]
     assert cell.rmse["net"] < 0.3 * cell.rmse["pd"]
     assert cell.rmse["net"] < 0.2 * cell.rms
-
-
-def test_a_target_ahead_of_the_joint_gives_positive_torque(result: FitResult) -> None:
     error, still = np.full(6, 0.2), np.zeros(6)
     ahead, behind = result.net.torque(np.stack([np.concatenate([error, still]), np.concatenate([-error, still])]))
-    assert ahead > 1.0
-    assert behind < -1.0
+    assert behind < -1.0 < 1.0 < ahead
 
 
-def test_one_seed_gives_one_net(recordings: list[Recording], result: FitResult) -> None:
+def test_one_seed_gives_one_net_and_leaves_torchs_threads_and_random_state_alone(
+    recordings: list[Recording], result: FitResult
+) -> None:
+    before, threads = torch.random.get_rng_state(), torch.get_num_threads()
     again = fit(recordings, QUICK)
+    assert torch.equal(before, torch.random.get_rng_state())
+    assert torch.get_num_threads() == threads
     for name, values in result.net.arrays().items():
         assert np.array_equal(values, again.net.arrays()[name]), name
     assert again.net.info == result.net.info
     other = fit(recordings, replace(QUICK, seed=1, epochs=1, half_net=False))
     assert not np.array_equal(other.net.weights[0], result.net.weights[0])
-
-
-def test_training_leaves_torchs_threads_and_random_state_alone(recordings: list[Recording]) -> None:
-    before, threads = torch.random.get_rng_state(), torch.get_num_threads()
-    fit(recordings, replace(QUICK, epochs=1, half_net=False))
-    assert torch.equal(before, torch.random.get_rng_state())
-    assert torch.get_num_threads() == threads
 
 
 def test_training_stops_when_validation_does_not_get_better(recordings: list[Recording]) -> None:
@@ -374,8 +362,6 @@ def test_what_cannot_be_had_is_missing_with_a_reason(recordings: list[Recording]
 
 
 def test_the_report_is_text_and_json_and_a_page_per_joint(result: FitResult, tmp_path: Path) -> None:
-    import json
-
     assert json.loads(json.dumps(asdict(result.report)))["cells"][0]["joint"] == "FR_hip"
     lines = text(result.report).splitlines()
     row = next(line for line in lines if line.startswith("all") and " all " in line)
@@ -401,49 +387,45 @@ def test_a_net_survives_its_file(by_kind: FitResult, tmp_path: Path) -> None:
 
 
 def test_a_damaged_or_foreign_file_is_refused(result: FitResult, tmp_path: Path) -> None:
-    good = tmp_path / "good.npz"
+    good, bad = tmp_path / "good.npz", tmp_path / "bad.npz"
+    with pytest.raises(NetFileError, match=r"bad\.npz: no such file"):
+        load(bad)
     result.net.save(good)
-    raw = good.read_bytes()
-    arrays = dict(np.load(good, allow_pickle=False))
-    bad = tmp_path / "bad.npz"
+    raw, arrays = good.read_bytes(), dict(np.load(good, allow_pickle=False))
+    header = str(arrays["header"])
 
-    def refused(message: str) -> None:
+    def saved(array: np.ndarray) -> bytes:
+        np.save(tmp_path / "one.npy", array, allow_pickle=True)
+        return (tmp_path / "one.npy").read_bytes()
+
+    def changed(**changes: np.ndarray | None) -> bytes:
+        np.savez(bad, **{name: values for name, values in (arrays | changes).items() if values is not None})
+        return bad.read_bytes()
+
+    def headed(old: str, new: str) -> bytes:
+        assert old in header
+        return changed(header=np.array(header.replace(old, new)))
+
+    with zipfile.ZipFile(tmp_path / "nonsense.npz", "w") as archive:
+        archive.writestr("header.npy", "nonsense")
+    flipped = raw[:3000] + bytes([raw[3000] ^ 1]) + raw[3001:]
+    foreign = (b"", b"hello", raw[: len(raw) // 2], flipped, (tmp_path / "nonsense.npz").read_bytes())
+    cases = [(content, "not an actuator net") for content in (*foreign, saved(np.array([{}], dtype=object)))]
+    cases += [
+        (saved(np.zeros(3)), "no .npz archive"),
+        (changed(**dict.fromkeys(arrays), a=np.zeros(3)), "no header"),
+        (changed(weight_0=arrays["weight_0"][:, :-1]), "weight_0: must be float64"),
+        (changed(skip=arrays["skip"] * np.nan), "skip: must be finite"),
+        (changed(input_std=arrays["input_std"] * 0), "input_std: must be positive"),
+        (changed(bias_1=None), "arrays missing: bias_1"),
+        (headed('"format":1', '"format":2'), "header.format"),
+        (headed('"history":6', '"history":"6"'), "header.history"),
+        (headed('"groups":["all"]', '"groups":["hip"]'), "header.groups"),
+    ]
+    for content, message in cases:
+        bad.write_bytes(content)
         with pytest.raises(NetFileError, match=rf"bad\.npz: .*{message}"):
             load(bad)
-
-    with pytest.raises(NetFileError, match="no such file"):
-        load(bad)
-    for content in (b"", b"hello", raw[: len(raw) // 2], raw[:3000] + bytes([raw[3000] ^ 1]) + raw[3001:]):
-        bad.write_bytes(content)
-        refused("not an actuator net")
-    with bad.open("wb") as file:
-        np.save(file, np.zeros(3))
-    refused("no .npz archive")
-    with bad.open("wb") as file:
-        np.save(file, np.array([{}], dtype=object), allow_pickle=True)
-    refused("not an actuator net")
-    np.savez(bad, a=np.zeros(3))
-    refused("no header")
-    np.savez(bad, **{**arrays, "weight_0": arrays["weight_0"][:, :-1]})
-    refused("weight_0: must be float64")
-    np.savez(bad, **{**arrays, "skip": arrays["skip"] * np.nan})
-    refused("skip: must be finite")
-    np.savez(bad, **{**arrays, "input_std": arrays["input_std"] * 0})
-    refused("input_std: must be positive")
-    np.savez(bad, **{name: values for name, values in arrays.items() if name != "bias_1"})
-    refused("arrays missing: bias_1")
-    for old, new, message in (
-        ('"format":1', '"format":2', "header.format"),
-        ('"history":6', '"history":"6"', "header.history"),
-        ('"groups":["all"]', '"groups":["hip"]', "header.groups"),
-    ):
-        text = str(arrays["header"])
-        assert old in text
-        np.savez(bad, **{**arrays, "header": np.array(text.replace(old, new))})
-        refused(message)
-    with zipfile.ZipFile(bad, "w") as archive:
-        archive.writestr("header.npy", "nonsense")
-    refused("not an actuator net")
 
 
 @pytest.mark.parametrize("form", ["one", "several"])
@@ -466,17 +448,16 @@ def test_onnx_agrees_with_the_formula(form: str, result: FitResult, by_kind: Fit
         np.testing.assert_allclose(by_onnx.reshape(nets, rows), expected, rtol=0, atol=1e-5)
 
 
-def test_a_net_knows_the_range_it_was_trained_in(recordings: list[Recording], result: FitResult) -> None:
-    rows = windows(recordings[:4], QUICK.inputs, 6, 0.005)
-    assert result.net.input_low[0, 1] == rows.x[:, 6:].min()
-    assert result.net.input_high[0, 0] == rows.x[:, :6].max()
-
-
-def test_a_net_says_where_it_comes_from(recordings: list[Recording], result: FitResult) -> None:
+def test_a_net_says_where_it_comes_from_and_the_range_it_was_trained_in(
+    recordings: list[Recording], result: FitResult
+) -> None:
     origin = result.net.info.provenance
     assert (origin.train, origin.validation, origin.held_out) == (("e0", "e1", "e2", "e3"), ("e4",), ("e5", "e6"))
     assert origin.recordings == {r.meta.episode: fingerprint(r) for r in recordings}
     assert result.net.info.kp == (KP, KP)
+    rows = windows(recordings[:4], QUICK.inputs, 6, 0.005)
+    assert result.net.input_low[0, 1] == rows.x[:, 6:].min()
+    assert result.net.input_high[0, 0] == rows.x[:, :6].max()
     moved = Recording(recordings[0].meta, {**recordings[0].channels, "t": recordings[0].t + 1e-9})
     assert fingerprint(moved) != fingerprint(recordings[0])
     assert fingerprint(Recording(meta("e0", notes="x"), recordings[0].channels)) != fingerprint(recordings[0])

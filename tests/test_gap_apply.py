@@ -133,12 +133,8 @@ def test_a_result_that_is_missing_or_damaged_is_refused_in_words(tmp_path: Path)
     damaged: list[bytes] = [b"", b"\xff\xfe", b"[]", b"3", b"{}", b"null", text[:-200].encode()]
     damaged += [json.dumps({k: v for k, v in plain.items() if k != gone}).encode() for gone in ("named", "verdict")]
     changes = {"verdict": "fine", "named": [{"effect": "coulomb"}], "floors": "low", "excess": {"null": "much"}}
-    changes |= {
-        "before": {"joints": ["a"]},
-        "waterfall": [["one"]],
-        "candidates": {"a": 1},
-        "bootstrap_share": {"a": {}, "b": "x"},
-    }
+    changes |= {"before": {"joints": ["a"]}, "waterfall": [["one"]], "candidates": {"a": 1}}
+    changes |= {"bootstrap_share": {"a": {}, "b": "x"}}
     damaged += [json.dumps({**plain, key: value}).encode() for key, value in changes.items()]
     for content in damaged:
         file.write_bytes(content)
@@ -224,10 +220,8 @@ def test_a_calibration_of_other_joints_joins_the_effect_in_training_as_in_the_pr
 
 
 def test_files_of_an_earlier_answer_do_not_stay(tmp_path: Path) -> None:
-    write(
-        result(named("viscous", "compensating", damping={"FR_hip": 0.3}), box={"coulomb": {"bound": {"FR_hip": 0.02}}}),
-        tmp_path,
-    )
+    lean = named("viscous", "compensating", damping={"FR_hip": 0.3})
+    write(result(lean, box={"coulomb": {"bound": {"FR_hip": 0.02}}}), tmp_path)
     assert {p.name for p in tmp_path.iterdir()} == {EFFECT, CALIBRATION, COMPENSATING}
     nearly = {"coulomb": {"bound": dict.fromkeys(JOINTS, 1e-6)}}  # a thousandth of the tolerance is no news
     assert [p.name for p in write(result(FRICTION, box=nearly), tmp_path)] == [EFFECT]

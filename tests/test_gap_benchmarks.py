@@ -6,6 +6,7 @@ import csv
 import hashlib
 import json
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import commands, gap_ablations, gap_real, gap_sysid
+from benchmarks import commands, gap_ablations, gap_next, gap_real, gap_sysid
 from benchmarks.gap import cases, generate, known, logger, score
 from benchmarks.gap.intervals import median, share
 from benchmarks.gap.simulate import simulate
 from benchmarks.gap.truth import Truth, apply
-from benchmarks.gap_next import CASES, SEPARATED, Row, figures, line_of, main, ratios
+from benchmarks.gap_next import CASES, SEPARATED, Row, figures, line_of, ratios
 from go1exp import robot
 from go1exp.config.schema.registry import members
 from go1exp.gap import files
@@ -264,8 +265,6 @@ def test_the_command_checks_the_seal_and_writes_flat_results(
     seal.write_text("0" * 64 + "  answers.json\n")
     with pytest.raises(SystemExit, match="not the answers that were sealed"):
         score.main(words)
-    with pytest.raises(SystemExit, match="usage"):
-        score.main([])
 
 
 # ---------------------------------------------------------------------- ablations: one set of cases for all methods
@@ -372,16 +371,25 @@ def test_there_are_sixty_cases_and_every_ablation_is_a_setting() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("main", "words", "message"),
     [
-        (["out=x"], "usage"),
-        (["out=x", "seed=one"], "seed=one: must be a whole number"),
-        (["out=x", "seed=1", "methods=whole,guess"], "methods=guess: there are whole"),
+        (gap_ablations.main, ["out=x"], "usage"),
+        (gap_ablations.main, ["out=x", "seed=one"], "seed=one: must be a whole number"),
+        (gap_ablations.main, ["out=x", "seed=1", "methods=whole,guess"], "methods=guess: there are whole"),
+        (gap_next.main, ["out=x", "pairs=kd,tilts"], "pairs=tilts: there are tilt"),
+        (gap_next.main, ["out=x", "strategies=best"], "strategies=best: "),
+        (gap_next.main, ["n=2"], r"python -m benchmarks.gap_next out=DIR"),
+        (gap_next.main, ["out=x", "most"], r"python -m benchmarks.gap_next out=DIR"),
+        (gap_next.main, ["out=x", "strategy=next"], r"python -m benchmarks.gap_next out=DIR"),
+        (gap_real.main, ["data=x"], "usage"),
+        (gap_real.main, ["data=x", "out=y", "nonsense"], "usage"),
+        (gap_real.main, ["data=x", "out=y", "sets=go3"], "sets=go3: there are xl330"),
+        (score.main, [], "usage"),
     ],
 )
-def test_a_wrong_argument_is_refused(words: list[str], message: str) -> None:
+def test_a_wrong_argument_is_refused(main: Callable[[list[str]], object], words: list[str], message: str) -> None:
     with pytest.raises(SystemExit, match=message):
-        gap_ablations.main(words)
+        main(words)
 
 
 # ---------------------------------------------------------------------- recordings until a pair is separated
@@ -429,21 +437,6 @@ def test_pairs_are_of_registered_effects_that_look_alike() -> None:
     for case in CASES.values():
         assert {case.truth, case.rival} <= {*members("effect")}
     assert all(confounded(CASES[name].truth, CASES[name].rival) for name in {*CASES} - {"spring"})
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [(["out=x", "pairs=kd,tilts"], "pairs=tilts: there are tilt"), (["out=x", "strategies=best"], "strategies=best: ")],
-)
-def test_an_unknown_pair_or_strategy_is_named(words: list[str], message: str) -> None:
-    with pytest.raises(SystemExit, match=message):
-        main(words)
-
-
-@pytest.mark.parametrize("words", [["n=2"], ["out=x", "most"], ["out=x", "strategy=next"]])
-def test_a_call_that_is_wrong_is_answered_with_the_usage(words: list[str]) -> None:
-    with pytest.raises(SystemExit, match=r"python -m benchmarks.gap_next out=DIR"):
-        main(words)
 
 
 # ---------------------------------------------------------------------- real robots
@@ -510,16 +503,10 @@ def test_sets_are_asked_as_a_whole_and_by_halves_and_never_twice(
     assert '"real_certified": 2' in (tmp_path / "out" / "gap.json").read_text()
 
 
-@pytest.mark.parametrize("words", [["data=x"], ["data=x", "out=y", "sets=go3"], ["data=x", "out=y", "nonsense"]])
-def test_what_is_wrong_with_a_call_is_said(words: list[str]) -> None:
-    with pytest.raises(SystemExit, match=r"usage|sets=go3: there are xl330"):
-        gap_real.main(words)
-
-
 # ---------------------------------------------------------------------- the baseline that fits everything at once
 
 
-pytestmark = pytest.mark.skipif(
+needs_sysid = pytest.mark.skipif(
     not hasattr(gap_sysid.sysid, "optimize"), reason='mujoco.sysid lacks its own dependencies: "mujoco[sysid]"'
 )
 
@@ -538,6 +525,7 @@ def recordings(truth: Truth, seconds: float, motions: tuple[str, ...] = ("steps"
     ]
 
 
+@needs_sysid
 @pytest.mark.parametrize("effect", gap_sysid.FITTED)
 def test_the_model_at_the_hidden_values_replays_the_hidden_robot(effect: str) -> None:
     name = gap_sysid.FITTED[effect][0]
@@ -555,6 +543,7 @@ def test_the_model_at_the_hidden_values_replays_the_hidden_robot(effect: str) ->
     assert fit.rms(np.zeros(params.size)) > 3.0 * right
 
 
+@needs_sysid
 def test_one_replay_for_four_legs_gives_the_jacobian() -> None:
     fit = gap_sysid.Fit(recordings(Truth(), 0.4, ("gait",)), NOISE)
     x = np.zeros(gap_sysid.parameters().size)
@@ -566,6 +555,7 @@ def test_one_replay_for_four_legs_gives_the_jacobian() -> None:
     np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(expected).max())
 
 
+@needs_sysid
 @pytest.mark.slow("benchmarks/")
 def test_a_large_armature_is_found_and_the_verdict_can_be_scored(tmp_path: Path) -> None:
     case = cases.make("null", 0, 5, count=3, seconds=1.5)  # a clean robot, to which one effect is added
@@ -587,6 +577,7 @@ def test_a_large_armature_is_found_and_the_verdict_can_be_scored(tmp_path: Path)
     assert found.figures["first_exact"][0] == 1.0, found.failures
 
 
+@needs_sysid
 def test_what_is_no_recording_is_a_bad_log(tmp_path: Path) -> None:
     (tmp_path / "case_x").mkdir()
     (tmp_path / "case_x" / "episode_00.parquet").write_bytes(b"nothing")

@@ -262,16 +262,17 @@ def resampled(values: np.ndarray, sd: np.ndarray, seed: int = 0) -> np.ndarray:
     return values + sd * np.random.default_rng(seed).standard_normal((200, len(values)))
 
 
-def test_values_within_one_tolerance_are_alike_however_well_they_are_known() -> None:
+def test_values_differ_beyond_one_tolerance_and_beyond_their_own_errors() -> None:
     close = 0.009 + 0.0029 * np.linspace(0.0, 1.0, 12)
-    assert not differ(close, resampled(close, 1e-7 * EVEN), TOLERANCE)
-
-
-def test_a_larger_difference_counts_only_beyond_its_own_errors() -> None:
+    assert not differ(close, resampled(close, 1e-7 * EVEN), TOLERANCE)  # within one tolerance, however well known
     assert np.ptp(WALK) > TOLERANCE
-    assert not differ(WALK, resampled(WALK, 0.0009 * EVEN), TOLERANCE)
-    assert differ(WALK, resampled(WALK, 0.0001 * EVEN), TOLERANCE)
     assert differ(WALK, np.tile(WALK, (200, 1)), TOLERANCE)
+    for sd, differs in ((0.0009, False), (0.0001, True)):
+        draws = resampled(WALK, sd * EVEN)
+        assert differ(WALK, draws, TOLERANCE) == differs
+        assert differ(WALK, draws + 0.003 * np.arange(12), TOLERANCE) == differs  # where resamples lie is no matter
+    shared = 0.01 * np.random.default_rng(1).standard_normal((200, 1))
+    assert differ(WALK, resampled(WALK, 0.0001 * EVEN) + shared, TOLERANCE)  # errors of all joints are of no difference
 
 
 def test_a_joint_of_which_little_is_known_hides_no_others() -> None:
@@ -280,17 +281,6 @@ def test_a_joint_of_which_little_is_known_hides_no_others() -> None:
     assert not differ(values, resampled(values, sd), TOLERANCE)
     values[7] = 0.014
     assert differ(values, resampled(values, sd), TOLERANCE)
-
-
-def test_errors_that_joints_share_are_none_of_a_difference() -> None:
-    shared = 0.01 * np.random.default_rng(1).standard_normal((200, 1))
-    assert differ(WALK, resampled(WALK, 0.0001 * EVEN) + shared, TOLERANCE)
-
-
-def test_where_resamples_lie_does_not_matter_but_how_far_they_spread() -> None:
-    moved = resampled(WALK, 0.0001 * EVEN) + 0.003 * np.arange(12)
-    assert differ(WALK, moved, TOLERANCE)
-    assert not differ(WALK, resampled(WALK, 0.0009 * EVEN) + 0.003 * np.arange(12), TOLERANCE)
 
 
 @pytest.mark.parametrize("spread", [0.0, 1.0], ids=["one value", "a tolerance apart"])

@@ -16,38 +16,23 @@ from go1exp.gap import files
 from go1exp.gap.comparison import _last_check, clock_taken, compare, prepare
 from go1exp.gap.data.cutting import even_clock
 from go1exp.gap.data.windows import splits
-from go1exp.gap.result import ClockChoice, GapResult, GapSettings
+from go1exp.gap.result import ClockChoice, GapResult
 from go1exp.gap.robots.fixed_base import FixedBase
 from go1exp.gap.score.initial_state import rescaled
 from go1exp.gap.score.likelihood import Scorer, grouped
-from go1exp.gap.search import clocks, tolerances
+from go1exp.gap.search import clocks
 from go1exp.gap.search.clocks import beginnings, rows_of, same_rows
 from go1exp.gap.search.state import Search
 from go1exp.gap.stages.apply import read_as
 from go1exp.gap.stages.explain import explain
 from go1exp.logs.recording import Recording
-from tests.test_gap_machines import machine, played, recording
+from tests import test_gap_machines as machines
+from tests.test_gap_machines import few, machine, played, recording  # noqa: F401  (few is a fixture)
 
-QUICK = GapSettings(
-    window_s=0.25,
-    stride_s=0.3,
-    effects=("coulomb",),
-    shortlist=1,
-    iterations=2,
-    max_terms=1,
-    bootstraps=0,
-    overlays=0,
-    confirm_fraction=0.2,
-)
+pytestmark = pytest.mark.usefixtures("few")
+QUICK = replace(machines.QUICK, effects=("coulomb",), shortlist=1, bootstraps=0, overlays=0, confirm_fraction=0.2)
 EVERY = 10
 """Steps of 0.5 ms between two rows: 200 Hz."""
-
-
-@pytest.fixture(autouse=True)
-def few(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only some of the nominal parameters may vary, so that a replay has ten variants and not forty."""
-    few = ("strength", "coulomb", "viscous", "link_mass", "base_tilt")
-    monkeypatch.setattr(tolerances, "nominal", lambda machine: few)
 
 
 def pendulum(clock: str = "compare") -> FixedBase:
@@ -84,18 +69,8 @@ def logs(motions: list[tuple[np.ndarray, ...]], stretched: float = 1.0, speeds: 
     ]
 
 
-def late(qd: np.ndarray) -> np.ndarray:
-    """Speeds behind a filter of 15 ms."""
-    return filtered(qd, 0.3)
-
-
-def very_late(qd: np.ndarray) -> np.ndarray:
-    """Speeds behind a filter of 100 ms."""
-    return filtered(qd, 0.05)
-
-
-def filtered(qd: np.ndarray, share: float) -> np.ndarray:
-    """Speeds behind a filter that goes a ``share`` of the way with each row."""
+def late(qd: np.ndarray, share: float = 0.3) -> np.ndarray:
+    """Speeds behind a filter that goes a ``share`` of the way with each row: 0.3 is 15 ms."""
     slow = qd.copy()
     for k in range(1, len(qd)):
         slow[k] = slow[k - 1] + share * (qd[k] - slow[k - 1])
@@ -110,12 +85,18 @@ def noisy(qd: np.ndarray) -> np.ndarray:
 # ---------------------------------------------------------------------- what is taken
 
 
-def test_of_stretched_times_those_of_the_speeds_are_taken(motions: list[tuple[np.ndarray, ...]]) -> None:
-    robot, choice = clock_taken(logs(motions, stretched=1.1), pendulum(), QUICK)
+def taken(recordings: list[Recording]) -> ClockChoice:
+    """Return the choice of a clock, by which the comparison goes on."""
+    robot, choice = clock_taken(recordings, pendulum(), QUICK)
     assert choice is not None
-    assert (choice.taken, choice.decided, choice.reason) == ("speeds", True, "")
     assert isinstance(robot, FixedBase)
-    assert robot.config.clock == "speeds"
+    assert robot.config.clock == choice.taken
+    return choice
+
+
+def test_of_stretched_times_those_of_the_speeds_are_taken(motions: list[tuple[np.ndarray, ...]]) -> None:
+    choice = taken(logs(motions, stretched=1.1))
+    assert (choice.taken, choice.decided, choice.reason) == ("speeds", True, "")
     assert choice.gain > choice.interval[0] > 0.0
     assert choice.errors["speeds"] < 0.5 * choice.errors["recorded"]
     assert choice.rate_hz["recorded"] == pytest.approx((200 / 1.1, 200 / 1.1), rel=1e-3)
@@ -127,28 +108,22 @@ def test_of_stretched_times_those_of_the_speeds_are_taken(motions: list[tuple[np
 def test_of_speeds_that_are_wrong_the_written_times_are_taken(
     motions: list[tuple[np.ndarray, ...]], speeds: Any
 ) -> None:
-    robot, choice = clock_taken(logs(motions, speeds=speeds), pendulum(), QUICK)
-    assert choice is not None
+    choice = taken(logs(motions, speeds=speeds))
     assert (choice.taken, choice.decided) == ("recorded", True)
-    assert isinstance(robot, FixedBase)
-    assert robot.config.clock == "recorded"
     assert choice.gain < choice.interval[1] < 0.0
     assert choice.errors["recorded"] < choice.errors["speeds"]
 
 
 def test_where_both_clocks_are_right_nothing_is_decided_and_that_is_said(motions: list[tuple[np.ndarray, ...]]) -> None:
-    _, choice = clock_taken(logs(motions), pendulum(), QUICK)
-    assert choice is not None
+    choice = taken(logs(motions))
     assert (choice.taken, choice.decided) == ("recorded", False)
     assert choice.reason
-    assert f"Which clock is right is not decided: {choice.reason}. The written times are taken" in clocks.sentence(
-        choice
-    )
+    undecided = f"Which clock is right is not decided: {choice.reason}. The written times are taken"
+    assert undecided in clocks.sentence(choice)
 
 
 def test_a_clock_with_holes_in_most_windows_does_not_compete(motions: list[tuple[np.ndarray, ...]]) -> None:
-    _, choice = clock_taken(logs(motions, speeds=very_late), pendulum(), QUICK)
-    assert choice is not None
+    choice = taken(logs(motions, speeds=lambda qd: late(qd, 0.05)))
     assert (choice.taken, choice.decided) == ("recorded", False)
     assert "by times from the speeds only" in choice.reason
     assert "windows are without holes" in choice.reason
@@ -157,8 +132,7 @@ def test_a_clock_with_holes_in_most_windows_does_not_compete(motions: list[tuple
 def test_without_speeds_there_is_one_clock(motions: list[tuple[np.ndarray, ...]]) -> None:
     several = logs(motions)
     del several[2].channels["qd_pendulum"]
-    _, choice = clock_taken(several, pendulum(), QUICK)
-    assert choice is not None
+    choice = taken(several)
     assert (choice.taken, choice.decided) == ("recorded", False)
     assert choice.reason == "1 of 4 recordings have no speeds, so there is one clock only"
     assert choice.errors == {}
@@ -167,8 +141,7 @@ def test_without_speeds_there_is_one_clock(motions: list[tuple[np.ndarray, ...]]
 
 def test_too_few_windows_decide_nothing(motions: list[tuple[np.ndarray, ...]]) -> None:
     short = [Recording(r.meta, {name: v[:200] for name, v in r.channels.items()}) for r in logs(motions)[:3]]
-    _, choice = clock_taken(short, pendulum(), QUICK)
-    assert choice is not None
+    choice = taken(short)
     assert not choice.decided
     assert "stretches of held-out windows remain" in choice.reason
 

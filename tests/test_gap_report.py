@@ -133,12 +133,8 @@ FULL: dict[str, Any] = {
     "floors": Floors({"q": 3.1e-4, "qd": 0.021}, {"q": 2.1e-5, "qd": 0.0011}, None),
     "excess": {"null": 56.3, "box": 40.2, "final": 0.312, "confirm": 0.288},
     "closed": 0.9922,
-    "not_excited": {
-        "torque_speed_limit": "steps",
-        "cogging": "slow_ramps",
-        "foot_friction": "squat",
-        "payload": "squat",
-    },
+    "not_excited": dict.fromkeys(("foot_friction", "payload"), "squat")
+    | {"torque_speed_limit": "steps", "cogging": "slow_ramps"},
     "advice": (
         "These logs cannot tell kd_scale from viscous; record torque_off swings, or two values of kd "
         "(gains=[[20,0.5],[20,1.0]]) to separate them.",
@@ -305,28 +301,18 @@ def test_a_page_copes_with_an_answer_that_says_nothing() -> None:
 
 
 def test_two_clocks_have_a_card_with_the_figures_of_both() -> None:
-    choice = ClockChoice(
-        taken="speeds",
-        decided=True,
-        rate_hz={"recorded": (90.0, 91.5), "speeds": (100.0, 100.0)},
-        windows=47,
-        nominal_errors={"recorded": 0.0211, "speeds": 0.0133},
-        errors={"recorded": 0.0094, "speeds": 0.0031},
-        terms={"recorded": ("coulomb", "armature"), "speeds": ()},
-        gain=0.52,
-        interval=(0.31, 0.74),
-        p=0.002,
-    )
+    both = {"rate_hz": ((90.0, 91.5), (100.0, 100.0)), "nominal_errors": (0.0211, 0.0133), "errors": (0.0094, 0.0031)}
+    both["terms"] = (("coulomb", "armature"), ())
+    figures: Any = {name: dict(zip(("recorded", "speeds"), of_each, strict=True)) for name, of_each in both.items()}
+    choice = ClockChoice("speeds", True, windows=47, gain=0.52, interval=(0.31, 0.74), p=0.002, **figures)
     text = Reader(page(replace(answer("explained"), clock=choice))).text
     assert "The times from the speeds are taken: in the median of 47 held-out windows" in text
     assert re.search(r"written times\s+90 to 91.5\s+21.1\s+9.4\s+coulomb, armature", text)
     assert re.search(r"times from the speeds\s+100\s+13.3\s+3.1\s+–", text)
     assert "time between rows" not in Reader(page(answer("explained"))).text
     alone = ClockChoice("recorded", False, "1 of 4 recordings have no speeds, so there is one clock only")
-    assert (
-        f"The clocks could not be compared: {alone.reason}. The written times are taken."
-        in Reader(page(replace(answer("explained"), clock=alone))).text
-    )
+    said = Reader(page(replace(answer("explained"), clock=alone))).text
+    assert f"The clocks could not be compared: {alone.reason}. The written times are taken." in said
 
 
 def test_a_page_copes_with_numbers_that_are_none() -> None:
@@ -449,12 +435,8 @@ def test_colours_grow_darker_with_the_excess_and_words_stay_legible() -> None:
 def test_windows_show_the_worst_joints() -> None:
     window = answer("explained").overlays[0]
     assert set(shown_joints(window)) < set(CALVES)
-    assert [split_channel(c) for c in ("q_FR_calf", "qd_a", "tau_est_b_c", "odd")] == [
-        ("q", "FR_calf"),
-        ("qd", "a"),
-        ("tau_est", "b_c"),
-        ("", "odd"),
-    ]
+    parts = {"q_FR_calf": ("q", "FR_calf"), "qd_a": ("qd", "a"), "tau_est_b_c": ("tau_est", "b_c"), "odd": ("", "odd")}
+    assert {channel: split_channel(channel) for channel in parts} == parts
 
 
 def on_its_feet() -> Overlay:
@@ -489,11 +471,7 @@ def test_a_window_of_a_walk_shows_the_trunk_and_no_empty_panel() -> None:
     assert "not recorded" not in shown
     assert ", ?" not in shown
     assert "the largest error of the nominal model, and the measurements of the IMU." in shown
-    assert [shown.count(f"{q}, {u}") for q, u in (("imu_gyro", "rad/s"), ("imu_acc", "m/s²"), ("tau_est", "N m"))] == [
-        1,
-        1,
-        0,
-    ]
+    assert [shown.count(axis) for axis in ("imu_gyro, rad/s", "imu_acc, m/s²", "tau_est, N m")] == [1, 1, 0]
     assert "imu_acc m/s² 0.2" in shown
 
 

@@ -199,16 +199,8 @@ def test_a_proof_refuses_other_tolerances_than_those_of_the_search() -> None:
 
 # ---------------------------------------------------------------------- what is found
 
-QUICK = GapSettings(
-    stride_s=0.4,
-    window_s=0.2,
-    effects=("coulomb", "viscous"),
-    shortlist=2,
-    iterations=2,
-    max_terms=1,
-    bootstraps=0,
-    overlays=0,
-)
+FEW: dict[str, int] = {"shortlist": 2, "iterations": 2, "max_terms": 1, "bootstraps": 0, "overlays": 0}
+QUICK = GapSettings(stride_s=0.4, window_s=0.2, effects=("coulomb", "viscous"), **FEW)  # type: ignore[arg-type]
 
 
 def test_friction_that_is_within_the_users_tolerance_is_no_gap(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -58,6 +58,7 @@ def test_every_recording_is_sound_and_survives_the_file(name: str, tmp_path: Pat
         assert r.meta.source == "measured"
         assert r.meta.notes
         assert r.has("q")
+        assert any(c.startswith("tau_") for c in r.channels) == (name == "ak80_double_pendulum")  # none is invented
     path = tmp_path / "x.parquet"
     recording.write(path, recordings[0])
     again = recording.read(path)
@@ -65,16 +66,10 @@ def test_every_recording_is_sound_and_survives_the_file(name: str, tmp_path: Pat
     assert all(again.channels[k].tobytes() == v.tobytes() for k, v in recordings[0].channels.items())
 
 
-def test_no_source_without_torque_gets_one() -> None:
-    for name in ("go2_in_air", "servo_pendulum_xl330", "so101_arm", "scaler_walk_mocap", "go1_walk_snippet"):
-        for r in imported(name):
-            assert not [c for c in r.channels if c.startswith("tau_")]
-
-
 # ---------------------------------------------------------------------- one by one
 
 
-def test_go2_targets_change_every_fourth_row_at_200_hz() -> None:
+def test_go2_joints_are_in_our_order_and_follow_their_own_targets_that_change_every_fourth_row() -> None:
     (r,) = imported("go2_in_air")
     assert r.t.shape == (8500,)
     assert r.meta.rate_hz == 200.0
@@ -84,10 +79,6 @@ def test_go2_targets_change_every_fourth_row_at_200_hz() -> None:
     steps = np.diff(changes)
     assert (steps == 4).mean() > 0.99  # the source drifts by a row three times in 8,500
     assert "No clock" in r.meta.notes
-
-
-def test_go2_joints_are_in_our_order_and_follow_their_own_targets() -> None:
-    (r,) = imported("go2_in_air")
     assert r.meta.joints == JOINTS
     assert r.joint("q_target")[0] == pytest.approx([0.0, 0.8, -1.5] * 4)
     first = r.joint("q")[0]  # row 0 of the source: FL -0.0249 0.783 -1.483, FR 0.0191 0.792 -1.494, RL ..., RR ...
@@ -98,7 +89,7 @@ def test_go2_joints_are_in_our_order_and_follow_their_own_targets() -> None:
     assert (lagged.argmax(axis=1) == np.arange(12)).all()
 
 
-def test_ak80_sits_on_the_steps_of_the_motors_messages() -> None:
+def test_ak80_sits_on_the_steps_of_the_motors_messages_and_has_a_target_where_one_was_followed() -> None:
     recordings = imported("ak80_double_pendulum")
     assert [r.meta.robot for r in recordings].count("ak80_double_pendulum_a") == 9
     for r in recordings:
@@ -108,19 +99,15 @@ def test_ak80_sits_on_the_steps_of_the_motors_messages() -> None:
         for joint in r.meta.joints:
             assert multiples(r.channels[f"q_{joint}"], 25 / 65535, 1e-3)  # 16 bits over +-12.5 rad: 3.81e-4 rad
             assert multiples(r.channels[f"tau_est_{joint}"], 24 / 4095, 1e-3)  # 12 bits over +-12 N m: 5.86e-3 N m
-
-
-def test_ak80_has_a_target_exactly_where_a_controller_followed_one() -> None:
-    recordings = imported("ak80_double_pendulum")
     followed = {r.meta.episode for r in recordings if r.has("q_target")}
     assert followed == {"ak80_a_trajectory_11", "ak80_c_trajectory_12", "ak80_c_trajectory_13"}
     for r in recordings:
-        assert not any("q_target" in name for name in r.channels) or r.has("q_target")
+        assert r.has("q_target") == any("q_target" in name for name in r.channels)
         assert r.has("tau_cmd")
         assert r.has("tau_est")
 
 
-def test_xl330_sits_on_4096_steps_a_turn_and_says_when_it_is_off() -> None:
+def test_xl330_sits_on_4096_steps_a_turn_follows_its_target_and_says_when_it_is_off() -> None:
     recordings = imported("servo_pendulum_xl330")
     for r in recordings:
         assert r.meta.joints == ("pendulum",)
@@ -130,17 +117,13 @@ def test_xl330_sits_on_4096_steps_a_turn_and_says_when_it_is_off() -> None:
         falls = r.meta.excitation == "lift_and_drop"
         assert (280 < r.meta.rate_hz < 290) if falls else (186 < r.meta.rate_hz < 190)
         assert r.channels["torque_enable"].all() != falls
-    assert {r.meta.excitation for r in recordings} == {"sin_sin", "sin_time_square", "up_and_down", "lift_and_drop"}
-    assert "gain 800 in the firmware's own unit" in recordings[-1].meta.notes
-
-
-def test_xl330_follows_its_target_and_hangs_down_after_its_fall() -> None:
-    for r in imported("servo_pendulum_xl330"):
         q, target = r.channels["q_pendulum"], r.channels["q_target_pendulum"]
-        if r.meta.excitation == "lift_and_drop":
-            assert abs(q[-50:].mean()) < 0.05
+        if falls:
+            assert abs(q[-50:].mean()) < 0.05  # it hangs down
         elif r.meta.excitation != "sin_time_square":  # which outruns the servo at low gain
             assert np.corrcoef(q, target)[0, 1] > 0.95
+    assert {r.meta.excitation for r in recordings} == {"sin_sin", "sin_time_square", "up_and_down", "lift_and_drop"}
+    assert "gain 800 in the firmware's own unit" in recordings[-1].meta.notes
 
 
 def test_so101_moves_by_whole_steps_and_the_jaw_is_left_out() -> None:
@@ -201,7 +184,7 @@ def test_scaler_without_near_motion_capture_has_no_truth() -> None:
         assert "No ground truth" in r.meta.notes
 
 
-def test_go1_snippet_explains_its_computed_torque() -> None:
+def test_go1_snippet_explains_its_computed_torque_and_stands_like_a_go1() -> None:
     (r,) = imported("go1_walk_snippet")
     source = raw("go1_walk_snippet", "go1_walk_2021-12-20_05-27-36.npz")
     assert r.t.shape == (54,)
@@ -213,10 +196,6 @@ def test_go1_snippet_explains_its_computed_torque() -> None:
     torque = kp * (r.joint("q_target")[1:] - r.joint("q")[:-1]) - kd * r.joint("qd")[:-1]
     theirs = source["tau_pd_computed"].reshape(54, 4, 3)[1:, [1, 0, 3, 2]].reshape(53, 12)  # FL FR RL RR -> ours
     assert torque == pytest.approx(theirs, abs=1e-4)
-
-
-def test_go1_snippet_stands_like_a_go1() -> None:
-    (r,) = imported("go1_walk_snippet")
     q = r.joint("q")
     assert r.meta.joints == JOINTS
     assert ((q > JOINT_POS_LIMITS[:, 0]) & (q < JOINT_POS_LIMITS[:, 1])).all()
@@ -230,6 +209,13 @@ def test_go1_snippet_stands_like_a_go1() -> None:
 
 
 # ---------------------------------------------------------------------- damaged sources
+
+
+def refused(importer: str, path: Path, match: str, options: dict[str, Any] | None = None) -> None:
+    """An import names the file first, and then what is wrong."""
+    with pytest.raises(RecordingError, match=match) as caught:
+        import_recordings(importer, path, options or {})
+    assert str(caught.value).startswith(str(path))
 
 
 def npz(path: Path, **arrays: Any) -> Path:
@@ -261,10 +247,7 @@ def so101(**changes: Any) -> dict[str, Any]:
     ],
 )
 def test_a_damaged_npz_is_named_with_its_key(tmp_path: Path, changes: dict[str, Any], match: str) -> None:
-    path = npz(tmp_path / "x.npz", **so101(**changes))
-    with pytest.raises(RecordingError, match=match) as caught:
-        import_recordings("so101_arm", path, {})
-    assert str(caught.value).startswith(str(path))
+    refused("so101_arm", npz(tmp_path / "x.npz", **so101(**changes)), match)
 
 
 def test_a_sound_npz_of_the_same_kind_passes(tmp_path: Path) -> None:
@@ -277,31 +260,23 @@ def test_a_truncated_npz_is_refused(tmp_path: Path, kept: float) -> None:
     path = npz(tmp_path / "x.npz", **so101())
     whole = path.read_bytes()
     path.write_bytes(whole[: int(kept * len(whole))])
-    with pytest.raises(RecordingError, match=r"x\.npz: not a whole \.npz"):
-        import_recordings("so101_arm", path, {})
+    refused("so101_arm", path, r"x\.npz: not a whole \.npz")
 
 
 def test_a_missing_path_and_an_empty_folder_are_named(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="no such file or folder"):
-        import_recordings("so101_arm", tmp_path / "none", {})
-    with pytest.raises(RecordingError, match=r"no \*\.npz in this folder"):
-        import_recordings("so101_arm", tmp_path, {})
+    refused("so101_arm", tmp_path / "none", "no such file or folder")
+    refused("so101_arm", tmp_path, r"no \*\.npz in this folder")
 
 
 def test_the_design_of_a_lone_pendulum_file_must_be_told(tmp_path: Path) -> None:
     keys = [f"{k}{i}" for k in ("pos_meas", "vel_meas", "tau_meas", "tau_con") for i in (1, 2)]
     path = npz(tmp_path / "run.npz", time=np.arange(5) * 0.002, **dict.fromkeys(keys, np.zeros(5)))
-    with pytest.raises(RecordingError, match="set design=A or design=C"):
-        import_recordings("ak80_double_pendulum", path, {})
+    refused("ak80_double_pendulum", path, "set design=A or design=C")
     (r,) = import_recordings("ak80_double_pendulum", path, {"design": "C"})
     assert r.meta.robot == "ak80_double_pendulum_c"
     assert not r.has("q_target")
-    with pytest.raises(RecordingError, match="no array 'tau_con2'"):
-        import_recordings(
-            "ak80_double_pendulum",
-            npz(tmp_path / "run.npz", time=np.arange(5) * 0.002, **dict.fromkeys(keys[:-1], np.zeros(5))),
-            {"design": "C"},
-        )
+    path = npz(tmp_path / "run.npz", time=np.arange(5) * 0.002, **dict.fromkeys(keys[:-1], np.zeros(5)))
+    refused("ak80_double_pendulum", path, "no array 'tau_con2'", {"design": "C"})
 
 
 HEADER = [*(f"jpos{i}" for i in range(12)), *(f"jvel{i}" for i in range(12)), *(f"jpos{i}_des" for i in range(12))]
@@ -329,9 +304,7 @@ WHOLE = ",".join([*HEADER, "kp", "kd"])
 def test_a_damaged_table_is_named_with_its_column(tmp_path: Path, text: str, match: str) -> None:
     path = tmp_path / "x.csv"
     path.write_text(text)
-    with pytest.raises(RecordingError, match=match) as caught:
-        import_recordings("go2_in_air", path, {})
-    assert str(caught.value).startswith(str(path))
+    refused("go2_in_air", path, match)
 
 
 def xl330(**changes: Any) -> str:
@@ -358,17 +331,15 @@ def xl330(**changes: Any) -> str:
 def test_a_damaged_servo_log_is_named_with_its_key(tmp_path: Path, text: str, match: str) -> None:
     path = tmp_path / "x.json"
     path.write_text(text)
-    with pytest.raises(RecordingError, match=match) as caught:
-        import_recordings("servo_pendulum_xl330", path, {})
-    assert str(caught.value).startswith(str(path))
+    refused("servo_pendulum_xl330", path, match)
 
 
 def test_torques_of_other_gains_are_noticed(tmp_path: Path) -> None:
     imported("go1_walk_snippet")
     source = raw("go1_walk_snippet", "go1_walk_2021-12-20_05-27-36.npz")
     source["tau_pd_computed"] = source["tau_pd_computed"] * 1.01
-    with pytest.raises(RecordingError, match=r"tau_pd_computed: does not belong to kp = 20, kd = 0.5"):
-        import_recordings("go1_walk_snippet", npz(tmp_path / "x.npz", **source), {})
+    path = npz(tmp_path / "x.npz", **source)
+    refused("go1_walk_snippet", path, r"tau_pd_computed: does not belong to kp = 20, kd = 0.5")
 
 
 # ---------------------------------------------------------------------- the registry
@@ -376,14 +347,15 @@ def test_torques_of_other_gains_are_noticed(tmp_path: Path) -> None:
 
 def test_names_and_options_are_checked_before_any_file_is_opened() -> None:
     nowhere = Path("nowhere")
-    with pytest.raises(ConfigError, match="unknown importer 'so101'; did you mean 'so101_arm'"):
-        import_recordings("so101", nowhere, {})
-    with pytest.raises(ConfigError, match="rate: unknown key 'rate'; did you mean 'rate_hz'"):
-        import_recordings("go2_in_air", nowhere, {"rate": 100})
-    with pytest.raises(ConfigError, match=r"importer.go2_in_air.rate_hz = -1"):
-        import_recordings("go2_in_air", nowhere, {"rate_hz": -1})
-    with pytest.raises(ConfigError, match="design = 'B'"):
-        import_recordings("ak80_double_pendulum", nowhere, {"design": "B"})
+    wrong: list[tuple[str, dict[str, Any], str]] = [
+        ("so101", {}, "unknown importer 'so101'; did you mean 'so101_arm'"),
+        ("go2_in_air", {"rate": 100}, "rate: unknown key 'rate'; did you mean 'rate_hz'"),
+        ("go2_in_air", {"rate_hz": -1}, "importer.go2_in_air.rate_hz = -1"),
+        ("ak80_double_pendulum", {"design": "B"}, "design = 'B'"),
+    ]
+    for name, options, match in wrong:
+        with pytest.raises(ConfigError, match=match):
+            import_recordings(name, nowhere, options)
 
 
 def test_every_importer_is_listed_with_a_sentence() -> None:
@@ -548,19 +520,14 @@ def spoilt(**fields: Any) -> Sent:
     ],
 )
 def test_a_log_that_lacks_something_is_named(tmp_path: Path, sent: Sent, options: dict[str, Any], match: str) -> None:
-    path = write_cdr(tmp_path / "log.mcap", sent)
-    with pytest.raises(RecordingError, match=match) as caught:
-        import_recordings("mcap_joint_state", path, options)
-    assert str(caught.value).startswith(str(path))
+    refused("mcap_joint_state", write_cdr(tmp_path / "log.mcap", sent), match, options)
 
 
 def test_a_topic_of_another_type_is_refused(tmp_path: Path) -> None:
     path = write_cdr(tmp_path / "log.mcap", states(5, ["a"]), kind="my_msgs/msg/Joints")
-    with pytest.raises(RecordingError, match="must be sensor_msgs/msg/JointState, not my_msgs/msg/Joints"):
-        import_recordings("mcap_joint_state", path, {})
+    refused("mcap_joint_state", path, "must be sensor_msgs/msg/JointState, not my_msgs/msg/Joints")
     path = write_json(tmp_path / "log.mcap", [(0, "/joint_states", {"position": [1.0]})])
-    with pytest.raises(RecordingError, match="/joint_states: message 0: name: required"):
-        import_recordings("mcap_joint_state", path, {})
+    refused("mcap_joint_state", path, "/joint_states: message 0: name: required")
 
 
 def test_a_damaged_log_is_refused(tmp_path: Path) -> None:
@@ -568,12 +535,10 @@ def test_a_damaged_log_is_refused(tmp_path: Path) -> None:
     whole = path.read_bytes()
     for kept in (0, 4, 100, len(whole) // 2, len(whole) - 1):
         path.write_bytes(whole[:kept])
-        with pytest.raises(RecordingError, match="not a whole MCAP file"):
-            import_recordings("mcap_joint_state", path, {})
+        refused("mcap_joint_state", path, "not a whole MCAP file")
     chunk = whole.index(b"\x28\xb5\x2f\xfd") + 20  # inside the first block of Zstandard
     path.write_bytes(whole[:chunk] + bytes([whole[chunk] ^ 255]) + whole[chunk + 1 :])
-    with pytest.raises(RecordingError, match="not a whole MCAP file"):
-        import_recordings("mcap_joint_state", path, {})
+    refused("mcap_joint_state", path, "not a whole MCAP file")
 
 
 def test_without_the_extra_the_message_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -635,15 +600,10 @@ def test_low_commands_of_a_go1_give_targets_and_gains(tmp_path: Path) -> None:
     assert (r.meta.kp, r.meta.kd) == ((20.0,) * 12, None)
     assert r.channels["q_target_RL_calf"].tolist() == [0.75] * 3 + [1.25] * 5
     assert np.array_equal(r.channels["q_RL_calf"], 11 + np.arange(2, 10) / 64)
-    for note in (
-        "of /low_cmd have no target",
-        "kd of /low_cmd changes",
-        "The 2 states before",
-    ):
+    for note in ("of /low_cmd have no target", "kd of /low_cmd changes", "The 2 states before"):
         assert note in r.meta.notes
 
 
 def test_low_states_of_too_few_motors_are_refused(tmp_path: Path) -> None:
     path = write_json(tmp_path / "log.mcap", [(i, "/low_state", low_state(i, motors=8)) for i in range(3)])
-    with pytest.raises(RecordingError, match="/low_state: a message has 8 motors; a go1 has 12"):
-        import_recordings("unitree_lowstate_go1", path, {})
+    refused("unitree_lowstate_go1", path, "/low_state: a message has 8 motors; a go1 has 12")
