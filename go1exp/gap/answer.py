@@ -91,10 +91,7 @@ def concluded(search: Search, warnings: list[str]) -> tuple[Search, Answer]:
 
 
 def why_withdrawn(search: Search, named: Sequence[NamedEffect], first: float) -> str:
-    """Return why nothing is to be named after all, where the tolerances suffice; empty if something is.
-
-    One effect of which that is sure keeps those that were fitted beside it.
-    """
+    """Return why nothing is named after all where the tolerances suffice; empty if one effect is beyond doubt."""
     if search.marginal and not any(beyond_doubt(n, search.state.tolerances) for n in named):
         return "no interval lies beyond its tolerance"
     if first <= search.settings.adequate and not any(n.status == "certified" for n in named):
@@ -103,10 +100,7 @@ def why_withdrawn(search: Search, named: Sequence[NamedEffect], first: float) ->
 
 
 def share_accepted(search: Search) -> float:
-    """Return the share of held-out windows within what the user accepts; NaN if that is nothing.
-
-    Of those of the last check if it is less there.
-    """
+    """Return the share of held-out windows that the user accepts, or of the last check if less there; NaN if none."""
     scorer, accept = search.state.scorer, search.settings.accept
     if not accept:
         return math.nan
@@ -182,10 +176,7 @@ def weak_joints(search: Search, effect: str, theta: Theta, drawn: Mapping[Key, n
 
 
 def bounded_joints(search: Search, effect: str, theta: Theta) -> tuple[int, ...]:
-    """Return the joints at which a term lies on a bound of its parameter, unless it does at all of its joints.
-
-    A joint of which a recording shows little goes there, since others draw it there.
-    """
+    """Return joints at which a term lies on a bound, drawn there where little shows; none if all of its joints do."""
     joints, known = search.state.scorer.windows.joints, search.state.tolerances
     if tolerances.identification(effect).common:
         return ()

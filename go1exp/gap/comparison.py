@@ -109,11 +109,7 @@ def robot_from(robot: RobotConfig | Robot) -> Robot:
 
 
 def prepare(recordings: Sequence[Recording], robot: Robot, settings: GapSettings) -> tuple[Robot, Ready]:
-    """Return the robot as it is in the recordings, and those of them that can be compared with it.
-
-    Raises:
-        NotComparable: if too many of them cannot.
-    """
+    """Return the robot as it is in recordings, and those that can be compared; NotComparable if too many cannot."""
     robot = robot.suited(recordings, settings.phase)
     reports = [audit(r) for r in recordings]
     left_out = sum(len(report.impossible) for report in reports)
@@ -163,15 +159,13 @@ def compare(
 ) -> Comparison:
     """Prepare recordings of one robot, cut them into windows, and measure the floors.
 
-    Where the model leaves open which clock they are read by, that is decided first, which takes as long
-    as four short searches. At least ``fewest`` windows are needed.
+    Where the model leaves open which clock they are read by, that is decided first, which takes as long as four short
+    searches. At least ``fewest`` windows are needed.
 
     ``physics_dt`` is the longest step of the simulation, s, to score at exactly that step. None takes that of the
-    settings, for which the influence of initial states may be measured at twice the step.
-
-    Raises:
-        NotComparable: if the recordings do not suit the robot, or are too short.
-        ConfigError: if recordings on the ground name different contacts, and none was chosen.
+    settings, for which the influence of initial states may be measured at twice the step. NotComparable if the
+    recordings do not suit the robot, or are too short. ConfigError if recordings on the ground name different contacts,
+    and none was chosen.
     """
     robot, clock = clock_taken(recordings, robot, settings, on_progress)
     on_progress("auditing the logs", 0.0)
@@ -217,10 +211,8 @@ def clock_taken(
     """Return the robot whose recordings are read by one clock, and how that was chosen; None if its model says which.
 
     With ``clock: compare`` both compete on windows that a later search does not keep for its last check, by either
-    clock. Only angles are compared there: the speeds make one of the clocks.
-
-    Raises:
-        NotComparable: if too many recordings do not suit the robot.
+    clock. Only angles are compared there: the speeds make one of the clocks. NotComparable if too many recordings do
+    not suit the robot.
     """
     if not (isinstance(robot, FixedBase) and robot.config.clock == "compare"):
         return robot, None

@@ -51,11 +51,7 @@ def remove_older(folder: Path) -> list[str]:
 
 
 def load(folder: Path) -> GapResult:
-    """Read the result in a folder.
-
-    Raises:
-        GapFileError: if there is none, or it is not one.
-    """
+    """Read the result in a folder; GapFileError if there is none, or it is not one."""
     path = folder / RESULT
     if folder.is_file():
         raise GapFileError(f"{folder}: is a file; out must be the folder of an answer, with {RESULT}")
@@ -75,11 +71,7 @@ def from_dict(plain: Mapping[str, Any]) -> GapResult:
 
 
 def search_of(result: GapResult) -> GapSettings:
-    """Return the settings of the search that found a result.
-
-    Raises:
-        GapFileError: if it does not say, or says what this version does not know.
-    """
+    """Return the settings of the search that found a result; GapFileError if this version does not know them."""
     try:
         kept = TypeAdapter(GapSettings).validate_json(json.dumps(result.provenance["settings"]))
     except (KeyError, ValidationError) as error:

@@ -179,19 +179,11 @@ class Recording:
         return all(column in self.channels for column in joint_channels(quantity, self.meta.joints))
 
     def joint(self, quantity: str) -> np.ndarray:
-        """Return a quantity of all joints, ``(T, J)`` in the order of ``meta.joints``.
-
-        Raises:
-            RecordingError: if a joint has no such column.
-        """
+        """Return a quantity ``(T, J)`` in the order of ``meta.joints``; RecordingError if one has no such column."""
         return self.block(*joint_channels(quantity, self.meta.joints))
 
     def block(self, *names: str) -> np.ndarray:
-        """Return the named columns side by side, ``(T, len(names))``.
-
-        Raises:
-            RecordingError: if one is missing.
-        """
+        """Return the named columns side by side, ``(T, len(names))``; RecordingError if one is missing."""
         return np.stack([self._column(name) for name in names], axis=1)
 
     def _column(self, name: str) -> np.ndarray:
@@ -290,11 +282,7 @@ IMPORT = "; a log of another format becomes a recording by go1exp record import"
 
 
 def read(path: Path) -> Recording:
-    """Read and check one recording; nothing is corrected.
-
-    Raises:
-        RecordingError: if the file is missing, truncated, damaged, no Parquet, or breaks the format in any way.
-    """
+    """Read and check one recording, correct nothing; RecordingError if it is missing, damaged or breaks the format."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -347,10 +335,8 @@ def _schema_problems(file: pq.ParquetFile) -> list[str]:
 def write(path: Path, recording: Recording) -> None:
     """Check a recording and write it. ``path`` is replaced in one step, so that no partial file is ever left.
 
-    Values are stored bit for bit; folders are made as needed.
-
-    Raises:
-        RecordingError: if the recording breaks the format; nothing is written then.
+    Values are stored bit for bit; folders are made as needed. RecordingError if the recording breaks the format;
+    nothing is written then.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -365,11 +351,7 @@ def write(path: Path, recording: Recording) -> None:
 
 
 def read_folder(path: Path) -> list[Recording]:
-    """Read every ``*.parquet`` of a folder, in the order of their names.
-
-    Raises:
-        RecordingError: if there is none, or one of them is damaged.
-    """
+    """Read all ``*.parquet`` of a folder by the order of names; RecordingError if there is none or one is damaged."""
     path = Path(path)
     files = sorted(path.glob("*.parquet"))
     if not files:

@@ -74,11 +74,8 @@ def windows(
     friction.
 
     Rows are left out if their window reaches before the start of the recording, over a gap of its clock, or into a time
-    in which ``torque_enable`` is false, or if their target is not finite.
-
-    Raises:
-        RecordingError: if a recording has no such channel; names it.
-        FitError: if the target needs a ``joint_torque`` and there is none.
+    in which ``torque_enable`` is false, or if their target is not finite. RecordingError if a recording has no such
+    channel; names it. FitError if the target needs a ``joint_torque`` and there is none.
     """
     if target == "joint_torque" and joint_torque is None:
         raise FitError(
@@ -200,10 +197,8 @@ def split(
     """Divide whole episodes among the three parts; an episode and its repeats (``repeat_of``) stay together.
 
     A number (0.2) takes this share of the clusters of repeats, at least one, in an order drawn with ``seed``; held-out
-    episodes are drawn before those for validation. A named episode takes its repeats with it.
-
-    Raises:
-        FitError: if a name is unknown or occurs twice, or nothing is left to train on.
+    episodes are drawn before those for validation. A named episode takes its repeats with it. FitError if a name is
+    unknown or occurs twice, or nothing is left to train on.
     """
     names = [recording.meta.episode for recording in recordings]
     twice = sorted({name for name in names if names.count(name) > 1})
@@ -273,10 +268,7 @@ WINDOW = 0.06
 
 @dataclass(frozen=True, eq=False)
 class SmoothMotion:
-    """Motion at the recording's time stamps: q rad, qd rad/s, qdd rad/s^2, each ``(T, J)``.
-
-    NaN in the half window at either end, where the polynomial would extrapolate: ``windows`` leaves such rows out.
-    """
+    """Motion at time stamps: q rad, qd rad/s, qdd rad/s^2, each ``(T, J)``; NaN in the half window at either end."""
 
     q: np.ndarray
     qd: np.ndarray
@@ -287,11 +279,8 @@ def smooth_motion(recording: Recording, window: float = WINDOW) -> SmoothMotion:
     """Differentiate the measured angles with a Savitzky-Golay filter of ``window`` s (third order, symmetric: no lag).
 
     The angles are resampled linearly to the median step of the clock, filtered, and read off at the recording's own
-    time stamps. Only ``q`` is used: the ``qd`` of an actuator has already been filtered.
-
-    Raises:
-        FitError: if the window holds fewer than ORDER + 2 samples or the recording is shorter than it.
-        RecordingError: if there is no ``q``.
+    time stamps. Only ``q`` is used: the ``qd`` of an actuator has already been filtered. FitError if the window holds
+    fewer than ORDER + 2 samples or the recording is shorter than it. RecordingError if there is no ``q``.
     """
     t, q = recording.t, recording.joint("q")
     step = float(np.median(np.diff(t))) if len(t) > 1 else window

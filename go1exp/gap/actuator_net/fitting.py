@@ -55,11 +55,9 @@ def fit(
 ) -> FitResult:
     """Train an actuator net on recordings of one robot and report on the episodes that were held out.
 
-    ``on_progress`` is called after every epoch; ``joint_torque`` is for ``settings.target = "joint_torque"``.
-
-    Raises:
-        FitError: if recordings do not fit together, or there are too few.
-        RecordingError: if one has no channel that the inputs or the target need.
+    ``on_progress`` is called after every epoch; ``joint_torque`` is for ``settings.target = "joint_torque"``. FitError
+    if recordings do not fit together, or there are too few. RecordingError if one has no channel that the inputs or the
+    target need.
     """
     robot, joints, period = _common(recordings, settings)
     _refuse_copies(recordings, settings)

@@ -41,11 +41,7 @@ class Trained:
 def train(
     rows: Rows, validation: Rows, settings: FitSettings, hidden: tuple[int, ...], on_epoch: OnEpoch | None = None
 ) -> Trained:
-    """Train one network of the widths ``hidden`` on ``rows``; the same seed gives the same weights.
-
-    Raises:
-        FitError: if there is nothing to train on or to validate with.
-    """
+    """Train one network of the widths ``hidden``, alike for one seed; FitError without rows to train or validate on."""
     for part, name in ((rows, "training"), (validation, "validation")):
         if len(part) == 0:
             raise FitError(f"no rows for {name}: its episodes are shorter than the history, or their actuators are off")

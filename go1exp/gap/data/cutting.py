@@ -238,10 +238,8 @@ def cut(
 
     A window begins where the motion is smooth, within a third of a stride of where it should, since its initial state
     comes from smoothing. Windows with holes are left out. ``doubt`` returns what to add to the misfit of an initial
-    state of a recording (number) at a time, s; where it is infinite, no window begins.
-
-    Raises:
-        RecordingError: if not one window fits.
+    state of a recording (number) at a time, s; where it is infinite, no window begins. RecordingError if not one window
+    fits.
     """
     quantities = QUANTITIES if settings.torque and all(r.has("tau_est") for r in recordings) else QUANTITIES[:2]
     sd = np.stack([noise_of([r.joint(name) for r in recordings]) for name in quantities])

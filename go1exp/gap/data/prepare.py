@@ -57,10 +57,7 @@ def clock_of_speeds(t: np.ndarray, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
 
 
 def noise_in_time(recordings: Sequence[Recording]) -> np.ndarray:
-    """Return the noise of the angles (J,), rad, where samples are uneven in time: about quartics through nine of them.
-
-    The median of root mean squares over all places, as such a robot may never be at rest.
-    """
+    """Return the noise of unevenly sampled angles (J,), rad, about quartics through nine: median over all places."""
     size, degree = 9, 4
     noises = []
     for r in recordings:
@@ -105,9 +102,7 @@ def contact_of(recordings: Sequence[Recording], chosen: ContactConfig | None) ->
     """Return the contact of the model that recordings of one robot are compared with.
 
     That is the ``chosen`` one, else the one that recordings on the ground name, or MuJoCo's own if none does.
-
-    Raises:
-        ConfigError: if they name different ones and none is chosen.
+    ConfigError if they name different ones and none is chosen.
     """
     if chosen is not None:
         return chosen
@@ -160,10 +155,7 @@ def too_coarse(contact: ContactConfig | None, dt: float) -> list[str]:
 
 
 def tolerances_of(result: GapResult) -> Tolerances:
-    """Return the tolerances that counted in a search, about the values that the model had.
-
-    Results of older versions name no contact; theirs was MuJoCo's own.
-    """
+    """Return the tolerances of a search, about the values of its model; an older result's contact was MuJoCo's own."""
     return Tolerances.from_effects(result.tolerances, result.contact or MUJOCO_CONTACT)
 
 

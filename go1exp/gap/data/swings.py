@@ -139,11 +139,7 @@ class SwingWindows(Windows):
 
 
 def cut_swings(recordings: Sequence[Recording], settings: GapSettings, config: RobotConfig) -> SwingWindows:
-    """Cut recordings of a Go1 with a free trunk into windows of legs in swing.
-
-    Raises:
-        RecordingError: if there is not one.
-    """
+    """Cut recordings of a Go1 with a free trunk into windows of legs in swing; RecordingError if there is none."""
     legs = Legs(config)
     logs = [Log.from_recording(r) for r in recordings]
     motions = [TrunkMotion.from_log(log, legs.imu_site) for log in logs]

@@ -70,10 +70,7 @@ class Windows:
         return tuple((f"{q}_{j}", c, i) for c, q in enumerate(self.quantities) for i, j in enumerate(self.joints))
 
     def demanded(self, windows: np.ndarray) -> np.ndarray:
-        """Return the torques (V, n, J), N m, that were asked for in some windows (V,), by what was measured.
-
-        Of the PD law; where there are no gains, the targets are torques. 0 while the drives are off.
-        """
+        """Return torques (V, n, J), N m, of the PD law on measurements, or torque targets; 0 while drives are off."""
         q, qd, t = self.y[windows, :, 0], self.y[windows, :, 1], self.t[windows]
         target, on = np.empty_like(q), np.empty(t.shape, dtype=bool)
         for row, k in enumerate(windows):
@@ -158,11 +155,7 @@ def stretches(episode: np.ndarray) -> np.ndarray:
 
 
 def _kept_whole(kinds: Sequence[tuple[object, ...]], wanted: int, rng: np.random.Generator) -> list[int]:
-    """Return which units to keep whole for the last check: of no motion the only one that is left.
-
-    What a motion alone shows (drives that are off, say) cannot be tested by a model that was fitted without it, and
-    would count against every term.
-    """
+    """Return which units to keep whole for the last check: never the only one of a motion that is left."""
     motions = [kind[0] for kind in kinds]
     likes = [(kinds.count(k), motions.count(k[0]), rng.random()) for k in kinds]
     kept: list[int] = []

@@ -228,11 +228,7 @@ def choose(
     settings: DesignSettings,
     on_progress: Callable[[str, float], None],
 ) -> Choice:
-    """Find the design that maximises the least power over the pairs that any design separates.
-
-    Raises:
-        DesignError: if every design goes beyond a limit.
-    """
+    """Find the design of the largest least power over the pairs that any separates; DesignError if all are too much."""
     rng, search = np.random.default_rng(settings.seed), _Search(stage, evaluators)
     on_progress("designs within the limits", 0.2)
     played = search.within_limits(library(settings.designs, settings.gains, attitudes, rng))

@@ -127,10 +127,7 @@ def limits_of(robot: Robot, windows: Windows, targets: Sequence[np.ndarray], saf
     """Return the limits of a robot, by targets (T, J), rad, of each of the recordings at hand and the user's shares.
 
     Motions are about the middle of the targets at hand, in which the robot has been. A joint whose model has no stops
-    may go where it has been in the recordings.
-
-    Raises:
-        DesignError: if the robot's base is not held.
+    may go where it has been in the recordings. DesignError if the robot's base is not held.
     """
     if not isinstance(robot, Movable):
         raise DesignError(

@@ -145,10 +145,8 @@ class Stage:
     def scored(self, played: Sequence[Rehearsal], dt: float, few: int) -> Scorer:
         """Return what scores replays of designs: their windows, whose ``episode`` is the number of the design.
 
-        At most ``few`` windows of each, spread over the motion but for its beginning.
-
-        Raises:
-            RecordingError: if not one window fits.
+        At most ``few`` windows of each, spread over the motion but for its beginning. RecordingError if not one window
+        fits.
         """
         comparison, settings = self.comparison, self.comparison.settings
         recordings = [_later(self.recording(r, k), FADE_S) for k, r in enumerate(played)]
@@ -171,10 +169,7 @@ def _later(recording: Recording, seconds: float) -> Recording:
 
 
 def write(played: Rehearsal, joints: tuple[str, ...], period: float, path: Path) -> Path:
-    """Write a design as a CSV: t in s, targets in rad, gains in N m/rad and N m s/rad, and whether drives are on.
-
-    ``go1exp record`` plays it as the excitation ``playback``, and takes the gains from its own setting ``gains``.
-    """
+    """Write a design as a CSV for ``playback``: t, s; targets, rad; gains, N m/rad and N m s/rad; drives on or not."""
     rows = len(played.motion.target)
     names = ["t", *joint_channels("q_target", joints), *joint_channels("kp", joints), *joint_channels("kd", joints)]
     gains = np.tile(np.concatenate([played.kp, played.kd]), (rows, 1))

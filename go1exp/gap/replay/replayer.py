@@ -24,10 +24,7 @@ LEVEL = (1.0, 0.0, 0.0, 0.0)  # attitude of a trunk that is held level, w-x-y-z
 
 @dataclass
 class Replayer:
-    """Runs the model through windows, ``max_rows`` side by side; keeps its batches of simulations for the next call.
-
-    ``quats`` (W, 4) are attitudes of a base that is held, w-x-y-z; ``threads`` are the engine's.
-    """
+    """Runs the model through windows, ``max_rows`` at once; a held base has attitudes ``quats`` (W, 4), w-x-y-z."""
 
     machine: Machine
     windows: Windows

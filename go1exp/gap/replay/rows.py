@@ -29,10 +29,7 @@ class Machine(Protocol):
 
     @property
     def base_probe(self) -> tuple[float, ...]:
-        """Changes of a free base's initial state by which its influence is measured; empty for one that is held.
-
-        Of a base that is moved as an IMU says, errors of that IMU.
-        """
+        """Changes of a free base's initial state, or of its IMU's errors, that are measured; empty for a held one."""
 
     @property
     def on_ground(self) -> bool:

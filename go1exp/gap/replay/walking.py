@@ -23,10 +23,7 @@ from go1exp.sim.env.plant import Plant
 
 
 class ImuRecorder:
-    """Keeps the motion of the trunks of a batch, and returns what their IMUs would measure.
-
-    With ``trunk`` it returns also the attitudes and velocities of the trunks.
-    """
+    """Keeps the trunks' motion; returns what their IMUs would measure, with ``trunk`` also attitudes and velocities."""
 
     def __init__(self, steps: int, rows: int, site: np.ndarray, trunk: bool) -> None:
         """Make room for ``steps`` steps of ``rows`` robots; the IMUs sit at ``site`` (3,) in the trunk, m."""
@@ -143,10 +140,7 @@ class SwingReplayer(Replayer):
     windows: SwingWindows
 
     def run(self, rows: Rows, dt: float) -> np.ndarray:
-        """Return what sensors would measure (R, n, C, J) at the windows' sample times.
-
-        Legs do not feel each other: rows that differ at different legs are simulated as one.
-        """
+        """Return sensors' values (R, n, C, J) at sample times; rows that differ at different legs are run as one."""
         packed, slot = packed_by_leg(rows, len(self.windows.joints))
         y, joints = super().run(packed, dt), _of_legs(len(self.windows.joints))
         return np.concatenate([y[at][..., leg] for leg, at in zip(joints, slot, strict=True)], axis=-1)

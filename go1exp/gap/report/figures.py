@@ -52,10 +52,7 @@ def shown_joints(overlay: Overlay) -> list[str]:
 
 
 def rows_of(overlay: Overlay) -> dict[str, list[str]]:
-    """Return the channels to draw by quantity: one column per shown joint, or per axis of the trunk.
-
-    A quantity without a measurement, or of the trunk without a prediction, has no row.
-    """
+    """Return the channels to draw by quantity, one column per shown joint or axis of the trunk, if there are curves."""
     given = {c for c, values in overlay.measured.items() if np.isfinite(values).any()}
     joints = shown_joints(overlay)
     rows: dict[str, list[str]] = {}

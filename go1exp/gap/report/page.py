@@ -24,10 +24,7 @@ MOST_FORESTS = 16  # parameters that are drawn; the table has all
 
 
 def write_report(result: GapResult, folder: Path) -> list[Path]:
-    """Write ``report.html`` and ``report.json`` into ``folder``, created if missing; return the two files.
-
-    The page needs no other file. The JSON file holds ``GapResult.as_dict``, with null for numbers that are not finite.
-    """
+    """Write ``report.html`` and ``report.json`` (``GapResult.as_dict``) into a folder, made if missing; return both."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     plain = json.dumps(result.as_dict(), indent=1, allow_nan=False, default=str)
@@ -229,10 +226,7 @@ def text(result: GapResult, status: int | None = None) -> str:
 
 
 def localisation_text(where: Localisation) -> str:
-    """Return a table of normalised chi2 - 1 by joint and regime for a terminal, ``*`` if significant.
-
-    Regimes without a sample are omitted.
-    """
+    """Return a table of chi2 - 1 by joint and regime for a terminal, ``*`` if significant; none without samples."""
     shown = [r for r in range(len(where.regimes)) if where.samples[:, r].any()]
     titles = [textwrap.wrap(where.regimes[r], 9, break_long_words=False) for r in shown]
     deep = max((len(title) for title in titles), default=0)

@@ -171,10 +171,8 @@ def _joint_problems(config: ModelConfig) -> list[str]:
 def parse_model(settings: Any, path: str = "model") -> ModelConfig | Go1Model:
     """Validate a choice of ``conf/model``; the Go1's ``mjcf`` is null.
 
-    A relative path of a MuJoCo file counts from the project's root. The file itself is not opened here.
-
-    Raises:
-        ConfigError: with every problem, each naming its key.
+    A relative path of a MuJoCo file counts from the project's root. The file itself is not opened here. ConfigError
+    with every problem, each naming its key.
     """
     if not isinstance(settings, Mapping):
         raise ConfigError([f"{path} = {settings!r}: must be a choice of conf/model or a FILE.yaml"])

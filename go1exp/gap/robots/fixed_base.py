@@ -73,11 +73,7 @@ class FixedBase:
 
     @staticmethod
     def from_config(config: ModelConfig, path: str = "model") -> FixedBase:
-        """Check a description against its MuJoCo file.
-
-        Raises:
-            ConfigError: with every problem, each naming its key.
-        """
+        """Check a description against its MuJoCo file; ConfigError with every problem, each naming its key."""
         index = {name: k for k, name in enumerate(config.joints)}
         groups = tuple(tuple(index[name] for name in group) for group in config.joint_groups)
         effort, top = (tuple(float(v) for v in config.per_joint(name)) for name in ("torque_limit", "speed_limit"))
@@ -174,11 +170,7 @@ class FixedBase:
         return replace(self, config=replace(self.config, clock=clock, speeds=speeds or self.config.speeds))
 
     def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
-        """Return recordings with what is missing taken from the description, and windows whose number is affordable.
-
-        Raises:
-            ValueError: if which clock they are read by is still to be compared.
-        """
+        """Return recordings with what the description adds, and affordable windows; ValueError if the clock is open."""
         if self.config.clock == "compare":
             raise ValueError("model.clock = 'compare': take a clock first (gap.comparison.compare does)")
         warnings = []
@@ -287,10 +279,8 @@ def robot_of(
 ) -> Robot:
     """Return the robot of a description, which messages call ``path``; the Go1 is ``config``, suspended.
 
-    ``contact`` is of a Go1's feet, if one was chosen.
-
-    Raises:
-        ConfigError: naming the key, if its MuJoCo file does not suit it, or a contact was chosen for a fixed base.
+    ``contact`` is of a Go1's feet, if one was chosen. ConfigError naming the key, if its MuJoCo file does not suit it,
+    or a contact was chosen for a fixed base.
     """
     if isinstance(model, Go1Model):
         return suspended(config, Tolerances.from_effects(model.tolerances), contact)

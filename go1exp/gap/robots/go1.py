@@ -121,10 +121,7 @@ class Go1:
 
 @dataclass(frozen=True)
 class StandingGo1(Go1):
-    """A Go1 that stands or moves on flat ground, its trunk free; tolerances are about the values of its contact.
-
-    ``held`` is the same robot with its trunk held, for recordings of it that were made so.
-    """
+    """A Go1 on flat ground, its trunk free, with its contact's tolerances; ``held`` is the same, its trunk held."""
 
     base_probe: tuple[float, ...] = BASE_PROBE
     on_ground: bool = True
@@ -182,10 +179,7 @@ class SwingingGo1(Go1):
 
 @dataclass(frozen=True)
 class SuspendedGo1(Go1):
-    """A Go1 whose trunk is held, so that its legs do not feel each other.
-
-    ``contact`` is of its feet where it stands in a recording; None takes the one that recordings name.
-    """
+    """A Go1 whose trunk is held: legs do not feel each other. ``contact`` of its feet: None is that of recordings."""
 
     groups: tuple[tuple[int, ...], ...] = LEGS
     contact: ContactConfig | None = None
@@ -206,11 +200,7 @@ class SuspendedGo1(Go1):
         return build_model(self.config, None, physics_dt, held=(w, x, y, z), mounted=mounted)
 
     def suited(self, recordings: Sequence[Recording], phase: Phase = "whole") -> Robot:
-        """Return the standing Go1, or its legs in the air, if its trunk is free in a recording, else this one.
-
-        Raises:
-            ConfigError: for a standing one, if recordings name different contacts and none was chosen.
-        """
+        """Return the Go1 standing, its legs in the air, or this one; ConfigError if contacts of recordings differ."""
         if not any(r.meta.base == "floating" for r in recordings):
             return self
         if phase == "swing":

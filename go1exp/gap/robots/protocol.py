@@ -29,14 +29,7 @@ class Robot(Machine, Protocol):
         """Return recordings without flaws as they are compared, and what had to be chosen."""
 
     def windows(self, ready: Ready) -> Windows:
-        """Cut recordings into windows; what is ignored has infinite noise.
-
-        Raises:
-            RecordingError: if they are too short.
-        """
+        """Cut recordings into windows, what is ignored with infinite noise; RecordingError if they are too short."""
 
     def replayer(self, windows: Windows, quats: np.ndarray, max_rows: int, threads: int) -> Replayer:
-        """Return what runs this robot through windows that it cut, ``max_rows`` side by side.
-
-        ``quats`` (W, 4) are attitudes of a base that is held, w-x-y-z; ``threads`` are the engine's.
-        """
+        """Return what runs this robot through its windows; a held base has attitudes ``quats`` (W, 4), w-x-y-z."""

@@ -29,10 +29,7 @@ DRAWS = 4  # states drawn from what remains uncertain
 
 
 def solved(state: np.ndarray, residual: np.ndarray, off: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the likeliest unknowns (W, k), in standard deviations, and the roots (W, k, k) of their covariance.
-
-    With ``off`` (W, l), the first l of them are by so much away from what was expected.
-    """
+    """Return the likeliest unknowns (W, k), sd, the first ``off`` (W, l) away, and roots (W, k, k) of covariance."""
     wide = state.astype(float)
     inner = np.swapaxes(wide, -1, -2) @ wide + np.eye(wide.shape[-1])
     right = (np.swapaxes(wide, -1, -2) @ residual[..., None].astype(float))[..., 0]

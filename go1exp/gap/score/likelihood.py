@@ -64,10 +64,7 @@ def grouped(machine: Machine, y: np.ndarray) -> np.ndarray:
 
 
 def gram(columns: np.ndarray, state: np.ndarray) -> np.ndarray:
-    """Return A' (I + S S')^-1 A (..., p, p) of columns A (..., m, p) and state sensitivities S (..., m, k).
-
-    By Woodbury's identity: A'A - A'S (I + S'S)^-1 S'A.
-    """
+    """Return A' (I + S S')^-1 A (..., p, p) of columns A (..., m, p), states S (..., m, k), by Woodbury's identity."""
     shape, k = columns.shape, state.shape[-1]
     wide = np.concatenate([columns, state], axis=-1).reshape(-1, shape[-2], shape[-1] + k)
     # One product of matrices at a time goes to BLAS; NumPy's stacked product of transposed arrays does not.
@@ -125,10 +122,7 @@ class Scorer:
 
 
 def state_probes(machine: Machine, theta: Theta | None = None) -> list[Probe]:
-    """Return the probes of the initial state: angles, then speeds, of each place in the groups; then of the base.
-
-    A base has a state where it is free, or where ``theta`` puts it on a compliant mount.
-    """
+    """Return the probes of angles, then speeds, of each place in the groups; then of a base that can move."""
     places, joints = range(len(machine.groups[0])), len(machine.joints)
     joints_probes = [
         Probe(kind, place, np.full(joints, size))
@@ -159,10 +153,7 @@ def scorer(
     clock_s: float = 0.0,
     subset: np.ndarray | None = None,
 ) -> Scorer:
-    """Measure how the initial states, and a clock that is off by ``clock_s``, act on the readings, at ``theta``.
-
-    ``subset`` holds the numbers of windows; with it, ``state`` is that of those windows alone.
-    """
+    """Measure how initial states and a clock off by ``clock_s`` act on readings of ``subset``, all windows if None."""
     w, machine = replayer.windows, replayer.machine
     probes = state_probes(machine, theta)
     everything = np.arange(len(w)) if subset is None else subset

@@ -138,10 +138,7 @@ def differences(scorer: Scorer, y: np.ndarray, window: np.ndarray, probes: Seque
 
 
 def table(scorer: Scorer, theta: Theta, windows: np.ndarray, probes: Sequence[Probe], dt: float) -> Table:
-    """Replay windows with every probe.
-
-    Changes are taken at the same step as residuals: at twice that they no longer cancel where they should.
-    """
+    """Replay windows with every probe, at the step of the residuals: at twice that, their errors would not cancel."""
     machine, replayer = scorer.replayer.machine, scorer.replayer
     y = replayer.run(variants(machine, theta, windows, probes), dt)
     y = y.reshape(len(windows), 1 + len(probes), *scorer.windows.y.shape[1:])

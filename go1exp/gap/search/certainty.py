@@ -86,10 +86,7 @@ def _grams(state: State, linear: Table) -> np.ndarray:
 
 
 def opposite(state: State, probes: Sequence[Probe]) -> list[Probe]:
-    """Return other changes of the same parameters: the other way, or half as far where a bound is in the way.
-
-    Shapes (a location, a phase) have no tolerance; their changes stay: two of them differ by curvature.
-    """
+    """Return other changes of the same parameters: the other way, or half as far at a bound; shapes keep theirs."""
     turned = []
     for probe in probes:
         assert isinstance(probe.key, tuple)

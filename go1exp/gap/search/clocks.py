@@ -87,10 +87,7 @@ def same_rows(
     Beside them, how many of the places that were tried each clock leaves: no window may have a hole by its clock.
 
     Noise is the smaller of what is seen by the clocks, since a wrong one makes motion look like noise. The first states
-    are as uncertain as by the clock that knows them less.
-
-    Raises:
-        RecordingError: if not one window fits by all clocks.
+    are as uncertain as by the clock that knows them less. RecordingError if not one window fits by all clocks.
     """
     clocks = {name: [even_clock(r) for r in logs] for name, logs in recordings.items()}
     first = next(iter(recordings.values()))
@@ -220,10 +217,7 @@ def decided(choice: ClockChoice, alpha: float) -> ClockChoice:
 def compared(
     log_chi2_of: Mapping[Clock, np.ndarray], stretch: np.ndarray, rng: np.random.Generator
 ) -> tuple[float, tuple[float, float], float]:
-    """Return by how much log chi2 (V,) is larger by the written times: mean, 95 % interval, two-sided p.
-
-    Windows of one stretch (V,) are neighbours and not independent, so signs are flipped, and samples drawn, by stretch.
-    """
+    """Return by how much log chi2 (V,) is larger by the written times: mean, 95 % interval, p; by stretch (V,)."""
     units = np.unique(stretch)
     difference = log_chi2_of["recorded"] - log_chi2_of["speeds"]
     total = np.array([difference[stretch == u].sum() for u in units])
@@ -250,10 +244,7 @@ class _HeldOut:
     def also(
         self, models: Mapping[Clock, tuple[Scorer, Theta]], sides: Mapping[Clock, Contestant], which: np.ndarray
     ) -> _HeldOut:
-        """Return the same with more windows (numbers), scored by models with one floor.
-
-        Each scorer has the error of the step of its own model in its noise. The larger of the two counts.
-        """
+        """Return the same with more windows (numbers), scored by models with one floor, the larger of the two."""
         floor = np.max([scorer.scale for scorer, _ in models.values()], axis=0)
         logs, errors = dict(self.log_chi2), dict(self.errors)
         for name, (scorer, theta) in models.items():

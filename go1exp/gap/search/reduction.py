@@ -26,10 +26,7 @@ def parts(joints: Sequence[str]) -> list[frozenset[int]]:
 
 
 def pieces(joints: Sequence[str]) -> list[frozenset[int]]:
-    """Return sets of joints that an effect may be at, by their names (``FR_hip``): each one, part, leg, side, and all.
-
-    A side is the legs that share a letter of their two: front, rear, right, left.
-    """
+    """Return sets of joints that an effect may be at, by names such as ``FR_hip``: each, part, leg, side, all."""
     names = [name.split("_", 1) if "_" in name else [name, ""] for name in joints]
     legs = list(dict.fromkeys(leg for leg, _ in names))
     sets = [*(frozenset([k]) for k in range(len(joints))), *parts(joints)]
@@ -263,10 +260,7 @@ def symmetrical(search: Search) -> Search:
 
 
 def still_equal(search: Search, name: str, instead: str, rest: State) -> tuple[str, ...]:
-    """Return which equals of a term do as well as the one that is to take its place (``rest``, fitted).
-
-    Each is fitted in the place of the term.
-    """
+    """Return which equals of a term, fitted in its place, do as well as the one that is to take it (``rest``)."""
     others = [n for n in search.aliases.get(name, ()) if n != instead and n not in search.state.terms]
     if not others:
         return ()
@@ -278,10 +272,7 @@ def still_equal(search: Search, name: str, instead: str, rest: State) -> tuple[s
 
 
 def instead_of(state: State, name: str) -> State:
-    """Return the state with the simpler effect in the place of a term, not fitted.
-
-    It begins half-way between two parameters of the term that are equal where it is that effect.
-    """
+    """Return the state with the simpler effect for a term, not fitted: half-way between two parameters of the term."""
     how = tolerances.identification(name)
     rest = state.without(name, how.simpler)
     if not how.simpler_if_equal:

@@ -149,10 +149,7 @@ def _levels(machine: Machine, effect: str, how: Identification, moved: Motion) -
 
 
 def _within(machine: Machine, key: Key, change: float | np.ndarray, like: np.ndarray) -> np.ndarray:
-    """Return a change from null in the shape of ``like``, a number within the parameter's bounds.
-
-    All 0 if next to nothing is left of it.
-    """
+    """Return a change from null in the shape of ``like``, a number within bounds; all 0 if next to nothing is left."""
     delta, p = np.broadcast_to(change, like.shape).copy(), machine.tolerances.param(key)
     if isinstance(change, np.ndarray):
         return delta
@@ -256,10 +253,7 @@ def rivals(screened: Sequence[Screened], active: Collection[str], within: Collec
 def _start(
     theta: Theta, variant: Variant, known: Sequence[Probe], layout: Layout, x: np.ndarray, machine: Machine
 ) -> Theta:
-    """Return where a fit begins: the present values with the variant's effect alone moved.
-
-    The linear model would move all else too far.
-    """
+    """Return the present values with the variant's effect alone moved: the linear model moves all else too far."""
     if variant.probes:
         extra = Layout.from_probes(machine, variant.probes)
         return variant.start(theta, extra, x[layout.size - extra.size :], machine)

@@ -10,10 +10,7 @@ from go1exp.gap.search import thresholds
 
 
 def gains(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return the fall of log chi2 (M, V G) of models (M, V, G) in every window and group of joints.
-
-    Groups do not feel each other, so each is a sample of its own; an effect that few windows show needs them all.
-    """
+    """Return the fall of log chi2 (M, V G) of models (M, V, G), of each window and group of joints by itself."""
     return np.asarray(log_chi2(before) - log_chi2(after)).reshape(len(after), -1)
 
 

@@ -46,10 +46,7 @@ def unmoved(score: Scorer, dt: float) -> Scorer:
 
 
 def profile_chi2(score: Scorer, theta: Theta, windows: np.ndarray, dt: float) -> np.ndarray:
-    """Return chi2 per value (V, 1) of a model, each window's initial state moved to suit it.
-
-    What the states are away from what sensors tell counts as much as readings do.
-    """
+    """Return chi2 per value (V, 1), initial states moved to suit the model; that counts as much as readings do."""
     w = score.windows
     joints, coordinates = len(w.joints), 2 * len(w.joints) + w.base_sd.shape[1]
     sd = np.concatenate([w.q_sd, w.qd_sd, w.base_sd], axis=1)[windows]
@@ -84,11 +81,7 @@ def profile_cost(score: Scorer, theta: Theta, windows: np.ndarray, dt: float) ->
 def fitted_alike(
     score: Scorer, keys: Sequence[Key], windows: np.ndarray, dt: float, nominal: float | None = None
 ) -> tuple[Theta, float]:
-    """Return the values of an effect that fit best, one number for each parameter, one parameter after the other.
-
-    Returns:
-        The values and their cost.
-    """
+    """Return the best values of an effect, one number a parameter, one after the other, and their cost."""
     theta: Theta = {}
     least = profile_cost(score, {}, windows, dt) if nominal is None else nominal
     for key in keys:
@@ -283,10 +276,7 @@ def clearest(first: Scorer, state: State) -> Sought:
 
 
 def _off_alike(first: Scorer, best: Theta, windows: np.ndarray, dt: float) -> Theta:
-    """Return what does most of what ``best`` does within tolerances: it, drives and legs, off alike.
-
-    Alike at all joints, and then the actuators of one part.
-    """
+    """Return what does most of what ``best`` does within tolerances: it, drives and legs, at all joints or a part's."""
     known = members("effect")
     effects = [
         name

@@ -151,10 +151,7 @@ class State:
         return replace(self, scorer=self.scorer.updated(self.theta))
 
     def finer(self) -> State:
-        """Return the state whose residuals are replayed at a finer step, by the same floors; on the ground itself.
-
-        Feet that touch the ground at another moment change more than the values do.
-        """
+        """Return the state replayed at a finer step by the same floors; itself on the ground, as contacts change."""
         finer = 1 if self.machine.on_ground else thresholds.FINER_STEPS
         return replace(self, scorer=replace(self.scorer, finer=finer))
 
@@ -253,10 +250,8 @@ class Search:
         return self.returned.get(term, math.nan)
 
     def removes(self, term: str) -> float:
-        """Return the share of the excess without a term that the term removes; NaN if not tested.
-
-        Beside a large effect a small one has little of the whole excess, and may still be all that is left without it.
-        """
+        """Return the share of the excess without a term that the term removes; NaN if not tested."""
+        # Beside a large effect a small one has little of the whole excess, and may be all that is left without it.
         back = self.share_of(term) * self.first
         without = back + max(excess(self.select_chi2), 0.0)
         return back / without if without > 0.0 else math.nan

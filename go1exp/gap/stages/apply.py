@@ -55,11 +55,7 @@ class Applied:
 
 
 def write(result: GapResult, folder: Path) -> tuple[Path, ...]:
-    """Write the effect files of a result and return those that there are.
-
-    Raises:
-        GapFileError: if the result names an effect or a parameter that is not in the library.
-    """
+    """Write the effect files of a result, return those there are; GapFileError for what is not in the library."""
     folder.mkdir(parents=True, exist_ok=True)
     certified = [n for n in result.named if n.status == "certified"]
     rest = [n for n in result.named if n.status != "certified"]
@@ -149,11 +145,7 @@ def _provenance(result: GapResult) -> list[str]:
 
 
 def terms_of(plain: Mapping[str, Any]) -> tuple[Term, ...]:
-    """Return the effects of a file's content, as training reads them.
-
-    Raises:
-        ValueError: if training would refuse it.
-    """
+    """Return the effects of a file's content, as training reads them; ValueError if training would refuse it."""
     parts, problems = parse_parts({"effect": plain}, ("effect",))
     if problems:
         raise ValueError("\n".join(problems))
@@ -184,10 +176,7 @@ def theta_of(terms: Sequence[Term], joints: Sequence[str]) -> Theta:
 
 
 def _reported(result: GapResult) -> float:
-    """Return the excess that the search had, on the same windows, with what the files hold; NaN if it did not say.
-
-    Results of older versions do not have it; theirs is of other windows, the held-out ones.
-    """
+    """Return the excess that the search had on these windows; of older results on held-out ones; NaN if none."""
     if "written" in result.excess:
         return result.excess["written"]
     certified = [n.effect for n in result.named if n.status == "certified"]
@@ -231,11 +220,8 @@ def prove(
     """Score written files at the step of training, s, on the windows on which the search scored what they hold.
 
     ``recordings`` and ``settings`` are those of the search, ``result`` is its outcome, and ``contents`` is what was
-    read back from the files, by file name.
-
-    Raises:
-        GapFileError: if logs or settings are not those of the search: what it held out would not be known.
-        NotComparable: if the recordings do not suit the robot.
+    read back from the files, by file name. GapFileError if logs or settings are not those of the search: what it held
+    out would not be known. NotComparable if the recordings do not suit the robot.
     """
     robot = read_as(robot_from(robot), result)
     phase = result.provenance.get("settings", {}).get("phase", "whole")  # what auto came to
@@ -282,11 +268,7 @@ def _same_contact(now: Tolerances, searched: Tolerances) -> None:
 
 
 def _windows(comparison: Comparison, result: GapResult) -> np.ndarray:
-    """Return the windows on which the search scored what it wrote: another split would be of other windows.
-
-    Raises:
-        GapFileError: if the recordings are cut otherwise now.
-    """
+    """Return the windows on which the search scored what it wrote; GapFileError if recordings are cut otherwise now."""
     count, numbers = result.provenance.get("windows"), result.provenance.get("evaluated")
     if not numbers:  # an older version's result
         parts = comparison.split(np.random.default_rng(comparison.settings.seed))

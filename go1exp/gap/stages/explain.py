@@ -57,10 +57,8 @@ def explain(
 
     Of a robot that walks, the legs in the air come first: they show effects at joints whatever the ground does. If they
     name something, that is the answer. Otherwise the standing robot is compared too (``settings.phase``).
-    ``on_progress`` is called with what is being done, and which share of the work is finished.
-
-    Raises:
-        ConfigError: if the whole robot is compared, and recordings on the ground name different contacts.
+    ``on_progress`` is called with what is being done, and which share of the work is finished. ConfigError if the whole
+    robot is compared, and recordings on the ground name different contacts.
     """
     settings, robot = settings or GapSettings(), robot_from(robot)
     if settings.phase != "auto":

@@ -99,11 +99,7 @@ def rivals(named: NamedEffect, terms: Sequence[str], robot: Robot) -> list[str]:
 
 
 def pairs_of(result: GapResult, robot: Robot) -> list[Pair]:
-    """Return each named effect of a result with each rival.
-
-    Raises:
-        DesignError: if the result names nothing for a reason that a recording cannot mend.
-    """
+    """Return each named effect with each rival; DesignError if none is named and no recording could mend that."""
     if result.verdict in ("bad log", "unexplained"):
         raise DesignError(
             f"the result is {result.verdict!r}: it names no effect to distinguish from others; "
@@ -203,11 +199,8 @@ def design(
     """Design the recording that best separates what a result leaves open.
 
     ``recordings``, ``robot`` and ``search`` are those of the search. With ``names_only`` what the recordings did not
-    excite is left out.
-
-    Raises:
-        DesignError: if there is nothing that a recording could separate, or none is within the limits.
-        NotComparable: if the recordings do not suit the robot.
+    excite is left out. DesignError if there is nothing that a recording could separate, or none is within the limits.
+    NotComparable if the recordings do not suit the robot.
     """
     robot = read_as(robot_from(robot), result).suited(recordings)
     _same_logs(result, recordings)

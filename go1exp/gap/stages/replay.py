@@ -222,10 +222,7 @@ def _measured(comparison: Comparison) -> Readings:
 
 
 def _measured_trunk(recordings: Sequence[Recording], taken: Callable[[Sequence[np.ndarray]], np.ndarray]) -> Readings:
-    """Return the readings of the IMU, and the true velocity of the trunk where the recordings have it.
-
-    ``taken`` returns the values (W, n, c) at the windows' sample times of each recording's values (T, c).
-    """
+    """Return the IMU's readings, and the trunk's true velocity if recorded: ``taken`` makes (T, c) to (W, n, c)."""
     imu = [r.block(*AXES) for r in recordings]
     readings = dict(zip(AXES, np.moveaxis(taken(imu), 2, 0), strict=True))
     noise = dict(zip(AXES[:3], noise_of([v[:, :3] for v in imu]).tolist(), strict=True))

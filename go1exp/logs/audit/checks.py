@@ -24,11 +24,7 @@ SHORTEST = 20  # fewest rows of a recording that are checked (chosen: a median s
 
 
 def audit_file(path: Path) -> AuditReport:
-    """Read a recording and audit it.
-
-    Raises:
-        RecordingError: if the file cannot be read or breaks the format.
-    """
+    """Read a recording and audit it; RecordingError if the file cannot be read or breaks the format."""
     return audit(read(path))
 
 

@@ -118,10 +118,7 @@ def _enough(log: Log) -> bool:
 
 
 def _matches_inputs(log: Log) -> tuple[np.ndarray, np.ndarray]:
-    """Return targets and angles (T, J), smoothed and without their mean.
-
-    While the actuators are off, both keep their last values: a free joint does not follow its target.
-    """
+    """Return targets and angles (T, J), smoothed and without mean, both held while the actuators are off."""
     n = log.samples(SMOOTH)
     held = np.maximum.accumulate(np.where(log.on, np.arange(len(log.t)), 0))
     target, q = (uniform_filter1d(log.recording.joint(name)[held], n, axis=0) for name in ("q_target", "q"))
@@ -129,10 +126,7 @@ def _matches_inputs(log: Log) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _lagged_correlation(log: Log, target: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the correlation (J, J) of each target (rows) with each joint (columns), at the lag where it is largest.
-
-    "Largest" is by absolute value. A pair of which one does not move has 0.
-    """
+    """Return correlations (J, J) of targets (rows) with joints at the lag of the largest absolute; 0 of what rests."""
     best = np.zeros((target.shape[1], q.shape[1]))
     live = np.outer(np.ptp(target, axis=0) > limits.STILL_ANGLE, np.ptp(q, axis=0) > limits.STILL_ANGLE)
     for lag in range(0, log.samples(LONGEST_LAG) + 1, log.samples(0.01)):

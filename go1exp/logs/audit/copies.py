@@ -115,10 +115,7 @@ class _Source:
         return _Source(x, _floor(log, channel), np.append(False, np.diff(x) != 0.0) & log.on)
 
     def repeated(self, y: np.ndarray, predictions: Iterable[Prediction], step: float = 0.0) -> float:
-        """Return in which share of rows ``y`` (T,) is nearer to a prediction than the noise in it allows.
-
-        The best prediction counts; ``step`` is the quantisation of ``y``.
-        """
+        """Return the share of rows in which ``y`` (T,), of steps ``step``, is nearer to a prediction than noise."""
         shares = [0.0]
         for predicted, gain in predictions:
             whole, noise = np.isfinite(predicted), self.noise * gain

@@ -168,10 +168,7 @@ def _step(x: np.ndarray) -> float:
 
 
 def _off(t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return how far each sample (T,) lies from the cubic through its four neighbours; 0 at the ends.
-
-    Where neighbours are missing the cubic is less exact, so there it counts for less.
-    """
+    """Return how far each sample (T,) is from the cubic through its four neighbours; less where any is missing."""
     at, near = t[2:-2], np.stack([t[:-4], t[1:-3], t[3:-1], t[4:]])
     others = ([j for j in range(4) if j != k] for k in range(4))
     weights = np.stack([np.prod((at - near[j]) / (near[k] - near[j]), axis=0) for k, j in enumerate(others)])
@@ -181,10 +178,7 @@ def _off(t: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def _lone_zeros(x: np.ndarray, sound: np.ndarray) -> np.ndarray:
-    """Return which ``sound`` samples (T,) are exactly 0 between values far from it, more often than x changes its sign.
-
-    Of a course through zero few samples are exactly 0.
-    """
+    """Return which ``sound`` samples (T,) are 0 between values far from it, more often than x changes its sign."""
     rows, y = np.zeros(len(x), dtype=bool), x[sound]
     short = [(a, b) for a, b in signals.stretches(y == 0.0) if a > 0 and b < len(y) and b - a <= limits.LOST_ROWS]
     lost = np.zeros(len(y), dtype=bool)

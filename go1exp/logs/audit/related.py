@@ -97,10 +97,7 @@ def _vertex(match: np.ndarray, k: int) -> float:
 
 
 def torque(log: Log) -> Iterator[Finding]:
-    """Compare the reported torque with the commanded one, or with the law of the joint controller, at the best lag.
-
-    Two kinds of lag are tried: a delayed command (before the controller), or a delayed torque (behind it).
-    """
+    """Compare the reported torque with the command or controller's law, at the best lag before it or behind."""
     r = log.recording
     if not r.has("tau_est"):
         return

@@ -109,10 +109,7 @@ def repeats(values: np.ndarray, step: float, reach: int) -> Repeats:
 
 
 def clipped(values: np.ndarray, step: float) -> tuple[float, list[float]]:
-    """Return the share of samples (T,) on flat maxima or minima that are entered or left at speed, and their levels.
-
-    A smooth signal comes to its peak with zero speed; a clipped one does not.
-    """
+    """Return the share of samples (T,) on flat extremes, entered or left at speed as no smooth peak is, and levels."""
     span = float(np.ptp(values))
     share, levels = 0.0, []
     for level in (float(values.max()), float(values.min())):
@@ -136,10 +133,7 @@ class Scale:
 
 
 def scale(reference: np.ndarray, other: np.ndarray, blocks: int = 10) -> Scale | None:
-    """Return how large ``other`` (N,) is against ``reference`` (N,), with a jackknife error over ``blocks`` in time.
-
-    Least squares: noise of ``other`` does not bias it. None if there are too few samples or nothing varies.
-    """
+    """Return the least-squares size of ``other`` (N,) to ``reference`` (N,), and its jackknife error, or None."""
     if len(reference) < limits.ENOUGH:
         return None
     parts = np.array_split(np.arange(len(reference)), blocks)

@@ -136,11 +136,7 @@ def resolution(log: Log) -> Iterator[Finding]:
 
 
 def noise(log: Log, repeats: dict[str, float]) -> tuple[list[Finding], dict[str, float]]:
-    """Measure the noise floor of each channel.
-
-    It is checked only if it looks white and the channel has few stale samples, since both stale samples and motion look
-    like noise otherwise.
-    """
+    """Measure each channel's noise floor; checked if white, with few stale samples, which look like noise too."""
     findings, floors = [], {}
     for name, (sigma, white) in log.floors.items():
         if not np.isfinite(sigma):

@@ -61,10 +61,7 @@ def squat(
 
 
 def _lowered(centre: np.ndarray, limits: np.ndarray, share: float) -> np.ndarray:
-    """Return joint angles (J,) with every hip lower by ``share`` of its height, the feet where they were.
-
-    Two links of length 1: x and z are the foot under the hip, in link lengths.
-    """
+    """Return joint angles (J,) with hips lower by ``share`` of their height, the feet where they were; links of 1."""
     if len(centre) % 3:
         toward = np.where(limits[:, 1] - centre > centre - limits[:, 0], limits[:, 1], limits[:, 0])
         return centre + share * (toward - centre)

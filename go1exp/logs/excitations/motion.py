@@ -51,11 +51,7 @@ def always_on(target: np.ndarray, support: Literal["suspended", "ground", "eithe
 
 
 def check(t: np.ndarray, centre: np.ndarray, limits: np.ndarray, fastest_hz: float = 0.0) -> float:
-    """Return the duration of ``t``, s.
-
-    Raises:
-        ExcitationError: if ``centre`` lies outside ``limits``, or the command rate cannot carry ``fastest_hz``.
-    """
+    """Return the duration of ``t``, s; ExcitationError for a centre outside or a rate too low for ``fastest_hz``."""
     for joint in np.flatnonzero((centre < limits[:, 0]) | (centre > limits[:, 1])):
         low, high = limits[joint]
         raise ExcitationError(f"joint {joint}: the centre {centre[joint]:g} rad must lie in [{low:g}, {high:g}] rad")
@@ -76,11 +72,7 @@ def spread(values: tuple[float, ...], num_joints: int) -> np.ndarray:
 def room(
     amplitude: tuple[float, ...] | np.ndarray, centre: np.ndarray, limits: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fit swings of ±``amplitude`` between the limits.
-
-    Returns:
-        middle (J,) of the swing, which differs from ``centre`` only near a limit, and half the swing (J,), rad.
-    """
+    """Return the middle (J,), near a limit not ``centre``, and half swing (J,), rad, of swings that fit the limits."""
     half = np.minimum(np.resize(amplitude, len(centre)), (limits[:, 1] - limits[:, 0]) / 2)
     return np.clip(centre, limits[:, 0] + half, limits[:, 1] - half), half
 

@@ -42,11 +42,7 @@ def import_recordings(name: str, path: Path, options: Mapping[str, Any]) -> list
 
 
 def _named_apart(path: Path, recordings: list[Recording]) -> list[Recording]:
-    """Return recordings with names of their own: those of one name get the folders of their files before it.
-
-    Raises:
-        RecordingError: if that does not tell them apart; with the files.
-    """
+    """Return recordings named apart by the folders of their files; RecordingError, with the files, if that fails."""
     names = Counter(r.meta.episode for r in recordings)
     result = []
     for r in recordings:

@@ -214,10 +214,8 @@ def one_source(
     """Return the messages of one source that has the joints, and note what is left out.
 
     Messages may list joints in another order, or lack a field, now and then. Where they come between regular ones, in
-    place of none, they are another publisher's.
-
-    Raises:
-        RecordingError: if no message has all joints, or one has a wrong number of values.
+    place of none, they are another publisher's. RecordingError if no message has all joints, or one has a wrong number
+    of values.
     """
     where, groups = f"{path}: {topic}", dict[tuple[Any, ...], list[State]]()
     for i, state in enumerate(states):
@@ -278,10 +276,7 @@ def channels(
     drop_repeats: bool,
     notes: list[str],
 ) -> tuple[dict[str, np.ndarray], list[State]]:
-    """Return the columns in the order of ``joints``, and the message of each row; append to the notes.
-
-    Commands are held from one to the next; rows before the first one are left out.
-    """
+    """Return columns in the order of ``joints``, commands held from the first on, and rows' messages; append notes."""
     chosen = {
         topic: one_source(path, topic, group, joints, notes, measured=topic == state_topic)
         for topic, group in states.items()
@@ -325,11 +320,7 @@ def _clock(chosen: Mapping[str, Sequence[State]], state_topic: str, notes: list[
 
 
 def _rows(where: str, now: np.ndarray, drop_repeats: bool, notes: list[str]) -> np.ndarray:
-    """Return the rows of times ``now`` (T,) to use; append to the notes.
-
-    Raises:
-        RecordingError: if a time repeats, and such rows are not to be left out.
-    """
+    """Return rows of times ``now`` (T,) to use; append to the notes; RecordingError for repeats that are to stay."""
     fresh, rows = without_repeats(now), np.arange(len(now))
     if len(fresh) == len(now):
         return rows
@@ -349,10 +340,7 @@ def _rows(where: str, now: np.ndarray, drop_repeats: bool, notes: list[str]) -> 
 def _blocks(
     topic: str, states: Sequence[State], joints: Sequence[str], notes: list[str]
 ) -> tuple[Sequence[State], dict[str, np.ndarray]]:
-    """Return messages that have all fields that are used, and field -> (T, J).
-
-    A field is not used if it is empty in more than a few messages, or zero or NaN in all (positions are used).
-    """
+    """Return messages with all used fields, and field -> (T, J): positions, and others in most, not all 0 or NaN."""
     used = []
     for key in states[0].fields:
         filled = sum(bool(s.fields[key]) for s in states)

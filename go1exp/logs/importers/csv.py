@@ -76,10 +76,7 @@ def _is_number(column: object) -> bool:
 
 
 def _columns(given: Mapping[str, Any], joints: tuple[str, ...] | None) -> tuple[dict[str, Column], list[str]]:
-    """Return channel -> column, and what is wrong with them as they are written.
-
-    A quantity, such as ``q``, is the column of a list with one element for each joint or axis.
-    """
+    """Return channel -> column (a list in one column is all joints or axes), and what is wrong with them as written."""
     mapping, wrong = {}, []
     for name, value in given.items():
         if isinstance(value, str) or _is_number(value):
@@ -247,11 +244,7 @@ def _place(table: Table, rows: np.ndarray, k: int) -> str:
 
 
 def _with_units(path: Path, mapping: Mapping[str, Column], units: Mapping[str, str]) -> dict[str, Column]:
-    """Return the columns with the units of the line below the names, where the mapping gives none.
-
-    Raises:
-        RecordingError: if such a unit is unknown.
-    """
+    """Return columns, units of the line below the names where none is given; RecordingError if one is unknown."""
     result = dict(mapping)
     for name, column in mapping.items():
         quantity, text = _quantity(name), units.get(column.column, "").strip("[]() ")

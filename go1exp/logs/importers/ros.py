@@ -268,11 +268,7 @@ def _lowstate(
 
 
 def _with_targets(path: Path, topic: str, states: Sequence[bags.State], notes: list[str]) -> list[bags.State]:
-    """Return the commands that have a target of every angle; append to the notes.
-
-    Raises:
-        RecordingError: if there is none.
-    """
+    """Return the commands that have a target of every angle; append to the notes; RecordingError if there is none."""
     commands = [state for state in states if max(map(abs, state.fields["position"])) < STOP]
     if left := len(states) - len(commands):
         notes.append(f"{left} commands of {topic} have no target of the angle (2.146e9) and are left out.")

@@ -71,10 +71,7 @@ def kind(start: bytes) -> str | None:
 def files(path: Path, *patterns: str) -> list[Path]:
     """Return ``path`` itself, or the files below the folder ``path`` that match the first pattern of any, by name.
 
-    The ending may be in capitals: ``*.csv`` matches ``RUN.CSV``, too.
-
-    Raises:
-        RecordingError: if there is none.
+    The ending may be in capitals: ``*.csv`` matches ``RUN.CSV``, too. RecordingError if there is none.
     """
     if path.is_file():
         return [path]
@@ -89,10 +86,7 @@ def files(path: Path, *patterns: str) -> list[Path]:
 
 
 def restarts(t: np.ndarray) -> list[int]:
-    """Return the rows at which a clock ``t`` (T,) begins anew; none if any step back is none of that kind.
-
-    There it loses at least half of what has passed since the last beginning, and then goes on by ordinary steps.
-    """
+    """Return rows where a clock (T,) begins anew, losing half of what passed; none if it steps back otherwise."""
     steps = np.diff(t)
     ordinary = MOST_STEPS * np.median(steps[steps > 0]) if (steps > 0).any() else 0.0
     begins, begin = [], 0
@@ -180,11 +174,7 @@ class Arrays:
         return key in self.values
 
     def numbers(self, key: str, *shape: int) -> np.ndarray:
-        """Return the array ``key``, ``(T, *shape)`` float64.
-
-        Raises:
-            RecordingError: if there is no such array, or it has another shape or is not numeric.
-        """
+        """Return the array ``key``, ``(T, *shape)`` float64; RecordingError if absent, of another shape or type."""
         values = self._get(key)
         if values.dtype.kind not in "fiub" or values.ndim != 1 + len(shape) or values.shape[1:] != shape:
             wanted = ", ".join(["T", *map(str, shape)]) + ("" if shape else ",")
@@ -205,11 +195,7 @@ class Arrays:
 
 
 def load_npz(path: Path) -> Arrays:
-    """Open a ``.npz`` of plain arrays; nothing is unpickled.
-
-    Raises:
-        RecordingError: if it is truncated, damaged, of another kind, or holds objects.
-    """
+    """Open a ``.npz`` of plain arrays, nothing is unpickled; RecordingError if damaged, no archive, or of objects."""
     try:
         with path.open("rb") as file:  # opened here, because NumPy does not close a damaged file
             archive = np.load(file, allow_pickle=False)
@@ -231,10 +217,7 @@ def is_parquet(path: Path) -> bool:
 def parquet_names(path: Path) -> dict[str, tuple[str, int | None, int]]:
     """Return the names of the columns -> column in the file, place in its lists (None: no list), length of these.
 
-    The first row has the lengths of lists.
-
-    Raises:
-        RecordingError: if it is damaged, has no rows, or is a recording.
+    The first row has the lengths of lists. RecordingError if it is damaged, has no rows, or is a recording.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -280,11 +263,7 @@ def parquet_columns(path: Path, wanted: Iterable[str]) -> dict[str, Any]:
 
 
 def rate(path: Path, t: np.ndarray) -> float:
-    """Return the sampling rate, Hz: the inverse of the median step of ``t``.
-
-    Raises:
-        RecordingError: if there are fewer than two time stamps, or they do not advance.
-    """
+    """Return the sampling rate, Hz: one by the median step of ``t``; RecordingError unless two stamps advance."""
     if len(t) < 2:
         raise RecordingError(f"{path}: t: has {counted(len(t), 'stamp')}; at least 2 are needed")
     steps = np.diff(t)
@@ -320,10 +299,8 @@ def recording(path: Path, importer: str, channels: dict[str, np.ndarray], **abou
     """Build a recording and check it; ``about`` are further fields of ``Meta``.
 
     By default the rate is that of the column ``t``, and the episode has the name of the file. The notes say it where
-    the torques of a Go1 have the steps of its packets, as those of ``go1exp deploy`` do.
-
-    Raises:
-        RecordingError: naming ``path``, if anything breaks the format.
+    the torques of a Go1 have the steps of its packets, as those of ``go1exp deploy`` do. RecordingError naming
+    ``path``, if anything breaks the format.
     """
     # What a source does not state is None in the metadata, not a guess.
     known: dict[str, Any] = dict.fromkeys(("base_quat", "kp", "kd", "tau_limit", "excitation", "repeat_of"))

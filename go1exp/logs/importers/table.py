@@ -146,11 +146,7 @@ def _lines(path: Path, layout: Layout) -> Iterable[tuple[int, str]]:
 
 
 def _text_names(path: Path, layout: Layout) -> dict[str, str]:
-    """Return the names of a text's columns without blanks round them -> the names that Arrow gives them.
-
-    Raises:
-        RecordingError: if it is no table, or two columns have one name.
-    """
+    """Return a text's column names, stripped -> as Arrow has them; RecordingError for no table or a name twice."""
     start = beginning(path)
     if layout.is_utf8 and start[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
         raise RecordingError(f"{path}: is UTF-16, not UTF-8; save it as UTF-8, or give encoding: utf-16")
@@ -187,11 +183,7 @@ def _text(path: Path, wanted: Mapping[str, str], layout: Layout) -> dict[str, An
 
 
 def _arrow(path: Path, layout: Layout, wanted: list[str] | None) -> Any:
-    """Return columns of a text as a table of Arrow; with None for ``wanted``, the names of all.
-
-    Raises:
-        RecordingError: if it is no table.
-    """
+    """Return columns of a text as Arrow's table, names of all if ``wanted`` is None; RecordingError if it is none."""
     import pyarrow as pa
     from pyarrow import csv as arrow_csv
 
@@ -289,22 +281,14 @@ def _question(text: str, layout: Layout) -> str:
 
 
 def _words(column: Any) -> np.ndarray:
-    """Return a column of labels (T,), words or numbers.
-
-    Raises:
-        ValueError: if a cell is empty.
-    """
+    """Return a column of labels (T,), words or numbers; ValueError if a cell is empty."""
     if column.null_count:
         raise ValueError(f"{counted(column.null_count, 'cell')} without a label")
     return np.asarray(column.to_numpy())
 
 
 def _numbers(column: Any, place: Callable[[int], str], layout: Layout) -> np.ndarray:
-    """Return a column of Arrow (T,), float64 or whole numbers.
-
-    Raises:
-        ValueError: if a cell is empty or is no finite number; with the place of the first such cell.
-    """
+    """Return a column of Arrow (T,), float64 or whole; ValueError with the place of the first cell without a number."""
     import pyarrow as pa
 
     if pa.types.is_boolean(column.type) or pa.types.is_integer(column.type) or pa.types.is_floating(column.type):

@@ -26,11 +26,7 @@ ROUNDING = 1e-4  # rad by which a target may lie beyond a limit: a file has a fe
 
 
 def written(path: Path) -> dict[str, np.ndarray]:
-    """Return the columns of a file of targets, by name, each (T,).
-
-    Raises:
-        ExcitationError: if it is missing, or no table of numbers with increasing times; the message names the column.
-    """
+    """Return columns (T,) by name of a file of targets; ExcitationError, naming a column, if it is no such table."""
     try:
         lines = path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -129,11 +125,7 @@ class PlayedMotion:
     """
 
     def __init__(self, name: str, motion: Motion, rate: float, gains: Gains) -> None:
-        """Take a motion of a suspended robot, whose rows are ``1 / rate`` s apart.
-
-        Raises:
-            ConfigError: if the motion is not for a suspended robot, or has the actuators off at times.
-        """
+        """Take a suspended robot's motion, rows ``1 / rate`` s apart; ConfigError if another or with drives off."""
         if motion.support == "ground":
             raise ConfigError(
                 [f"motion = {name!r}: is for a robot on the ground; deploy plays what a suspended one can do"]

@@ -72,11 +72,7 @@ class RecordingConfig:
 
 
 def make_motion(term: Term, seconds: float, rate_hz: float, seed: int) -> Motion:
-    """Return the motion of an excitation for the Go1, about its nominal stance.
-
-    Raises:
-        ConfigError: if it is shorter than a sample.
-    """
+    """Return an excitation's motion for the Go1 about its nominal stance; ConfigError if shorter than a sample."""
     t = np.arange(round(seconds * rate_hz)) / rate_hz
     if not len(t):
         raise ConfigError([f"seconds = {seconds:g}: shorter than a sample of the motion at {rate_hz:g} Hz"])
@@ -111,11 +107,8 @@ def refuse_too_long(config: RecordingConfig, key: str, count: int, each: int = 1
 def episodes(terms: Sequence[Term], config: RecordingConfig) -> list[Episode]:
     """Return an episode for each combination of motion, seed, base and gain set, and then the repetitions.
 
-    The first episode of each gain set is repeated.
-
-    Raises:
-        ConfigError: if a motion cannot be made on the wanted base, two episodes would have one name, or so many do not
-            fit into memory.
+    The first episode of each gain set is repeated. ConfigError if a motion cannot be made on the wanted base, two
+    episodes would have one name, or so many do not fit into memory.
     """
     if terms:  # as many as there are at least: where a motion is suspended is not known yet
         sets = len(config.gains)

@@ -54,10 +54,7 @@ class Rig:
 
 
 class Tape:
-    """Observes a plant and keeps one of every ``every`` steps.
-
-    Samples are the readings of the sensors without noise; effects that change readings are included.
-    """
+    """Observes a plant; keeps one of every ``every`` steps: noiseless readings, with effects that change them."""
 
     def __init__(self, plant: Plant, every: int, rows: int) -> None:
         """Start to observe: keep ``rows`` samples, one for each ``every`` steps, from the next step on."""
@@ -87,10 +84,7 @@ class Tape:
 
 
 def sample(plant: Plant, target: Tensor) -> dict[str, Tensor]:
-    """Return the present readings of N robots' sensors without noise, and the truth; (N, ...) each.
-
-    ``target`` (N, J) is in force from now on. Pose and velocity of a free trunk are ``base_...``.
-    """
+    """Return N robots' noiseless readings, the truth (``base_...`` of a free trunk), the target (N, J) from now on."""
     blocks, readings = plant.backend.sensors, plant.backend.sensordata
     quat = readings[:, blocks.imu_quat]
     measured = plant.effects.measure(
@@ -255,11 +249,7 @@ def meta(config: RobotConfig, sensors: SensorConfig, **changes: Any) -> Meta:
 
 
 def policy_task(rig: Rig, trained: TaskConfig, seconds: float) -> TaskConfig:
-    """Return the task in which a policy is recorded: the rig's robot under the commands of training, on flat ground.
-
-    Raises:
-        ConfigError: if the periods do not divide each other.
-    """
+    """Return a policy's task: the rig's robot, training's commands, flat ground; ConfigError if periods do not fit."""
     period = trained.sim.policy_dt
     # Two periods more than recorded, so that no time limit ends an episode.
     sim = dataclasses.replace(
@@ -288,10 +278,7 @@ class Walk:
 
 
 def play_policy(rig: Rig, walk: Walk, sensors: SensorConfig, seed: int, on_step: Progress) -> list[Recording]:
-    """Move robots by a policy under random commands and return the recordings.
-
-    A robot that falls is recorded up to its fall.
-    """
+    """Move robots by a policy under random commands, and return the recordings, each up to a fall if any."""
     held = None if walk.hang is None else held_quat(walk.hang)
     core = Go1Core(
         policy_task(rig, walk.trained, walk.seconds), len(walk.names), seed, imu=True, held=held, shared_dynamics=True
