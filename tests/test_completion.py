@@ -16,14 +16,13 @@ import go1exp.logs.record.motions  # noqa: F401  (registers every importer and e
 from go1exp.base.paths import data_root
 from go1exp.cli import EVERY, SUBVERBS, VERBS
 from go1exp.cli.app import app_of
-from go1exp.cli.completion import STAGES, WORDS, _importers, _listed, completions
+from go1exp.cli.completion import STAGES, WORDS, _importers, _listed, completions, serve
 from go1exp.cli.gap import GapVerb
 from go1exp.config.choices import config_folder, groups_in
 from go1exp.config.schema import registry
 from go1exp.sim.task import PPOConfig
 
 PROGRAM = "import sys; from go1exp.cli import main; sys.exit(main())"
-
 
 POLICIES = ("clock", "paper", "robust", "robust_history")
 """Shipped ones."""
@@ -36,13 +35,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (tmp_path / "runs" / run / "checkpoints").mkdir(parents=True)
         (tmp_path / "runs" / run / "config.yaml").touch()
     (tmp_path / "runs/flat/checkpoints/000400.pt").touch()
-    for file in (
-        "logs/walk.parquet",
-        "gap/effect.yaml",
-        "mine/reward/short.yaml",
-        "mine/weather/wind.yaml",
-        "walk.zip",
-    ):
+    others = ("logs/walk.parquet", "gap/effect.yaml", "mine/reward/short.yaml", "mine/weather/wind.yaml", "walk.zip")
+    for file in others:
         (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / file).write_text("a: 1\n")
     monkeypatch.chdir(tmp_path)
@@ -83,13 +77,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("train --config-dir mi", {"mine/"}),
         ("train --help rew", {"reward"}),
         ("train resume=runs/f", {"resume=runs/flat"}),
-        (
-            "train start_from=",
-            {
-                f"start_from={f}"
-                for f in ("clock", "paper", "robust", "robust_history", "gap/", "logs/", "mine/", "runs/")
-            },
-        ),
+        ("train start_from=", {f"start_from={f}" for f in (*POLICIES, "gap/", "logs/", "mine/", "runs/")}),
+        ("train hydra/launcher=", {f"hydra/launcher={f}" for f in ("basic", "joblib", "ray", "slurm", "slurm_gpu")}),
+        ("train hydra/l", {"hydra/launcher="}),
+        ("train study=", {"study=ablations", "study=walking_cpu"}),
         ("train --he", {"--help"}),
         ("eval run=r", {"run=runs/"}),
         ("eval run=runs/", {"run=runs/flat", "run=runs/rough one"}),
@@ -131,16 +122,14 @@ def test_words_that_are_offered_are_words_that_exist() -> None:
         assert {*WORDS[key]} in [{*get_args(hint[key])} for hint in hints if key in hint], key
 
 
-def query(line: str, tmp_path: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+def process(words: list[str], folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    env = {**os.environ, "PYTHONPATH": str(data_root()), **environment}
+    return subprocess.run(words, cwd=folder, env=env, capture_output=True, text=True, timeout=60)
+
+
+def query(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
     code = "import sys\nfrom go1exp.cli import main\nmain()\nprint(*sys.modules, file=sys.stderr)"
-    return subprocess.run(
-        [sys.executable, "-c", code, "-sc", "query=bash"],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(data_root()), "COMP_LINE": line, **environment},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    return process([sys.executable, "-c", code, "-sc", "query=bash"], folder, COMP_LINE=line)
 
 
 def test_a_key_press_imports_nothing_heavy(tmp_path: Path) -> None:
@@ -181,29 +170,13 @@ COMP_LINE=$1; COMP_POINT=${#COMP_LINE}; COMP_WORDBREAKS=$2
 $(complete -p go1exp | sed 's/.*-F \\([^ ]*\\).*/\\1/')
 printf '%s\\n' "${COMPREPLY[@]}"
 """
-    done = subprocess.run(
-        ["bash", "-c", script, "bash", line, breaks],
-        cwd=folder,
-        env={**os.environ, "PATH": f"{program.parent}:{os.environ['PATH']}", "PYTHONPATH": str(data_root())},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    path = f"{program.parent}:{os.environ['PATH']}"
+    done = process(["bash", "-c", script, "bash", line, breaks], folder, PATH=path)
     assert (done.stdout.splitlines(), done.stderr) == (offered, "")
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 @pytest.mark.parametrize("action", ["install", "uninstall"])
 def test_completion_is_installed_and_taken_away(action: str, shell: str, capsys: pytest.CaptureFixture[str]) -> None:
-    from go1exp.cli import completion
-
-    assert completion.serve(f"{action}={shell}") == 0
+    assert serve(f"{action}={shell}") == 0
     assert "go1exp" in capsys.readouterr().out
-
-
-def test_launchers_and_studies_are_completed() -> None:
-    assert completions("go1exp train hydra/launcher=") == [
-        f"hydra/launcher={name}" for name in ("basic", "joblib", "ray", "slurm", "slurm_gpu")
-    ]
-    assert completions("go1exp train hydra/l") == ["hydra/launcher="]
-    assert completions("go1exp train study=") == ["study=ablations", "study=walking_cpu"]

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from go1exp import robot
 from go1exp.base.paths import data_root
+from go1exp.cli.helptext import leaves
 from go1exp.config.schema.registry import ConfigError
 from go1exp.evaluate.controller import forces, gait
 from go1exp.evaluate.controller.batch import Driven
@@ -39,10 +40,10 @@ FILE = data_root() / "conf/controller/mpc.yaml"
 
 
 def given(**changes: Any) -> dict[str, Any]:
-    """What the file says, with other values under ``a__b``; it walks at once."""
+    """What the file says, with other values under ``a.b``; it walks at once."""
     content: dict[str, Any] = yaml.safe_load(FILE.read_text()) | {"stand": 0.0}
     for key, value in changes.items():
-        *path, last = key.split("__")
+        *path, last = key.split(".")
         place = content
         for part in path:
             place = place[part]
@@ -316,34 +317,26 @@ def told(one: Mpc, steps: int = 160) -> np.ndarray:
     )
 
 
-def leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    if isinstance(node, dict):
-        for key, value in node.items():
-            yield from leaves(value, f"{path}__{key}".strip("_"))
-    else:
-        yield path, node
-
-
 OTHER: dict[str, Any] = {
     "stand": 0.1,
     "period": 0.004,
     "height": 0.29,
-    "swing__reach": 0.01,
-    "gait__offsets": [0.0, 0.25, 0.5, 0.75],
-    "force__steps": 6,
-    "force__max_force": 60.0,
-    "force__effort": 1e-4,
-    "stance__slope": False,
-    "stance__max_slope": 0.01,
-    "stance__kd": 0.5,
-    "stance__contact_force": 30.0,
-    "smoothing__velocity": 0.05,
-    "force__max_lag": 0.001,
-    "force__max_turn_lag": 0.001,
+    "swing.reach": 0.01,
+    "gait.offsets": [0.0, 0.25, 0.5, 0.75],
+    "force.steps": 6,
+    "force.max_force": 60.0,
+    "force.effort": 1e-4,
+    "stance.slope": False,
+    "stance.max_slope": 0.01,
+    "stance.kd": 0.5,
+    "stance.contact_force": 30.0,
+    "smoothing.velocity": 0.05,
+    "force.max_lag": 0.001,
+    "force.max_turn_lag": 0.001,
 }
 """Other values of keys where half as much again is not one."""
 
-EVERY = [(key, value) for key, value in leaves(given()) if key != "name"]
+EVERY = [(key, value) for key, value in leaves(given()).items() if key != "name"]
 
 
 @pytest.fixture(scope="module")
@@ -379,10 +372,10 @@ def test_every_setting_acts(key: str, value: Any, usual: np.ndarray) -> None:
     ("key", "value", "says"),
     [
         ("height", 1.0, r"^controller\.height = 1\.0: .*less than or equal to 0\.4"),
-        ("force__steps", 2.5, r"^controller\.force\.steps = 2\.5"),
-        ("force__weights__velocity", [0.2, -1.0, 0.1], r"^controller\.force\.weights\.velocity\.1 = -1\.0"),
-        ("gait__offsets", [0.0, 0.5], r"^controller\.gait\.offsets"),
-        ("swing__hight", 0.1, r"^controller\.swing\.hight: unknown key"),
+        ("force.steps", 2.5, r"^controller\.force\.steps = 2\.5"),
+        ("force.weights.velocity", [0.2, -1.0, 0.1], r"^controller\.force\.weights\.velocity\.1 = -1\.0"),
+        ("gait.offsets", [0.0, 0.5], r"^controller\.gait\.offsets"),
+        ("swing.hight", 0.1, r"^controller\.swing\.hight: unknown key"),
         ("name", "mcp", r"^controller\.name: unknown controller 'mcp'; did you mean 'mpc'"),
     ],
 )

@@ -30,6 +30,7 @@ import numpy as np
 import pyarrow.parquet as parquet
 import pytest
 import torch
+import yaml
 from mujoco.batch import Batch
 from omegaconf import OmegaConf
 
@@ -147,136 +148,80 @@ NEEDS = {
 }
 """Choices that other choices must go with."""
 
+
+def given(text: str) -> dict[str, Any]:
+    """Keys and values of words such as ``ppo.steps=6``."""
+    return {key: yaml.safe_load(value) for key, _, value in (word.partition("=") for word in text.split())}
+
+
 SMALL: dict[str, dict[str, Any]] = {
-    "train": {
-        "sim.physics_dt": 0.005,
-        "sim.episode_s": 0.4,
-        "terrain.rows": 3,
-        "terrain.cols": 10,
-        "terrain.tile_size": 4.0,
-        "terrain.border": 2.0,
-        "curriculum.terrain_level.start_level_max": 1,
-        "backend.threads": 1,
-        "torch_threads": 1,
-        "ppo.num_envs": 8,
-        "ppo.iterations": 4,
-        "ppo.steps": 6,
-        "ppo.epochs": 2,
-        "ppo.minibatches": 4,
-        "ppo.learning_rate": 0.005,
-        "ppo.learning_rate_range": [0.003, 0.01],
-        "ppo.hidden": [8, 7, 6],
-        "logger.tensorboard": False,
-        "checkpoint.every": 1,
-    },
-    "eval": {
-        "grid": {"x": [0.5, 1.0], "y": [0.5], "yaw": [1.0], "cross": False},
-        "episodes": 2,
-        "duration_s": 0.2,
-        "settle_s": 0.1,
-        "noise": True,
-        "randomize": True,
-        "push": True,
-        "train_ground": True,
-    },
-    "play": {"seconds": 0.4, "noise": True, "randomize": True, "push": True, "train_ground": True, "viewer": "clip"},
-    "record": {"excitation": ["gait"], "seconds": 0.2, "physics_dt": 0.002, "episodes": 2},
+    "train": given("""
+        sim.physics_dt=0.005 sim.episode_s=0.4 backend.threads=1 torch_threads=1 logger.tensorboard=false
+        terrain.rows=3 terrain.cols=10 terrain.tile_size=4.0 terrain.border=2.0
+        curriculum.terrain_level.start_level_max=1 checkpoint.every=1
+        ppo.num_envs=8 ppo.iterations=4 ppo.steps=6 ppo.epochs=2 ppo.minibatches=4 ppo.learning_rate=0.005
+        ppo.learning_rate_range=[0.003,0.01] ppo.hidden=[8,7,6]
+    """),
+    "eval": given("""
+        grid.x=[0.5,1.0] grid.y=[0.5] grid.yaw=[1.0] grid.cross=false
+        episodes=2 duration_s=0.2 settle_s=0.1 noise=true randomize=true push=true train_ground=true
+    """),
+    "play": given("seconds=0.4 noise=true randomize=true push=true train_ground=true viewer=clip"),
+    "record": given("excitation=[gait] seconds=0.2 physics_dt=0.002 episodes=2"),
     "record_audit": {},
     "record_import": {},
-    "fit-actuator": {
-        "hidden": [6, 5, 4],
-        "epochs": 4,
-        "batch": 64,
-        "learning_rate": 0.2,
-        "patience": 1,
-        "epoch_rows": 400,
-        "plots": False,
-    },
-    "gap": {
-        "search.window_s": 0.1,
-        "search.burn_s": 0.02,
-        "search.stride_s": 0.15,
-        "search.physics_dt": 0.002,
-        "search.max_terms": 1,
-        "search.shortlist": 1,
-        "search.iterations": 1,
-        "search.bootstraps": 0,
-        "search.overlays": 1,
-        "search.threads": 1,
-    },
-    "export": {"seconds": 0.1},
+    "fit-actuator": given(
+        "hidden=[6,5,4] epochs=4 batch=64 learning_rate=0.2 patience=1 epoch_rows=400 plots=false",
+    ),
+    "gap": given("""
+        search.window_s=0.1 search.burn_s=0.02 search.stride_s=0.15 search.physics_dt=0.002 search.max_terms=1
+        search.shortlist=1 search.iterations=1 search.bootstraps=0 search.overlays=1 search.threads=1
+    """),
+    "export": given("seconds=0.1"),
     "export_check": {},
-    "deploy": {
-        "seconds": 0.04,
-        "stand_up": 0.06,
-        "hand_over": 0.04,
-        "lie_down": 0.04,
-        "brake": 0.06,
-        "patience": 0.1,
-        "keep": 0.2,
-    },
-    "sim": {"noise": 1.0},
+    "deploy": given("seconds=0.04 stand_up=0.06 hand_over=0.04 lie_down=0.04 brake=0.06 patience=0.1 keep=0.2"),
+    "sim": given("noise=1.0"),
     "list": {},
-    "bench": {"num_envs": 4, "rounds": 1, "seconds": 0.1, "threads": 1},
+    "bench": given("num_envs=4 rounds=1 seconds=0.1 threads=1"),
 }
 """Values that the traces use instead of those in conf/: fewer and shorter, or switched on so that others can act."""
 
-OTHER: dict[str, Callable[[Walk], list[Any]]] = {
-    "train:backend.threads": lambda walk: [2],
-    "train:torch_threads": lambda walk: [2],
-    "train:device": lambda walk: ["cuda"],
-    "train:logger.wandb": lambda walk: [{"project": "p", "mode": "offline", "group": None, "entity": None}],
-    "train:resume": lambda walk: [str(walk.trained("resumed"))],
-    "train:start_from": lambda walk: ["paper"],
-    "train:actuator.file": lambda walk: [str(walk.net(1))],
-    "train:actuator.period": lambda walk: ["resample"],
-    "train:effect": lambda walk: [{"coulomb": {"bound": 0.4}}],
-    "record:effect": lambda walk: [{"coulomb": {"bound": 0.4}}],
-    "record:excitation": lambda walk: [["steps"]],
-    "record:run": lambda walk: [str(walk.trained("other", "seed=5"))],
-    "record_audit:files": lambda walk: [[str(walk.recorded("lossy", {"sensors.dropped": 0.3}))]],
-    "record_import:source": lambda walk: ["so101_arm"],
-    "record_import:path": lambda walk: [str(walk.logs(1))],
-    "record_import:drop": lambda walk: ["impossible"],
-    "record_import:options": lambda walk: [{"rate_hz": 100.0}],
-    "record_import:columns": lambda walk: [{"q_hip": "jpos1"}],
-    "fit-actuator:recordings": lambda walk: [str(walk.recorded("noisy", {**FIVE, "sensors.qd.noise": 0.3}))],
-    "fit-actuator:gains": lambda walk: [[20.0, 0.5]],
-    "fit-actuator:inputs": lambda walk: [["position_error"]],
-    "fit-actuator:period": lambda walk: [0.004],
-    "fit-actuator:smoothing": lambda walk: [0.02],
-    "eval:run": lambda walk: [str(walk.trained("other", "seed=5"))],
-    "play:run": lambda walk: [str(walk.trained("other", "seed=5"))],
-    "play:out": lambda walk: ["other.gif"],
-    "play:physics_dt": lambda walk: [0.5 * SMALL["train"]["sim.physics_dt"]],
-    "eval:physics_dt": lambda walk: [0.5 * SMALL["train"]["sim.physics_dt"]],
-    "eval:measures": lambda walk: [["stride_rate"]],
-    "eval:checkpoint": lambda walk: [str(walk.trained("run") / "checkpoints/000003.pt")],
-    "play:checkpoint": lambda walk: [str(walk.trained("run") / "checkpoints/000003.pt")],
-    "gap:logs": lambda walk: [str(walk.recorded("stiff", {**HELD, "effect": {"viscous": {"damping": 0.6}}}))],
-    "gap:stage": lambda walk: ["localise"],
-    "gap:search.alpha": lambda walk: [1e-5],  # no p-value is a tenfold of that
-    "gap:search.min_share": lambda walk: [1.0],
-    "gap:search.adequate": lambda walk: [1e6],
-    "gap:search.material": lambda walk: [1e6],
-    "gap:accept": lambda walk: [1.0],
-    "gap:search.confirm_fraction": lambda walk: [0.5],
-    "gap:search.certified": lambda walk: [0.0],
-    "gap:search.max_rows": lambda walk: [64],
-    "export:run": lambda walk: [str(walk.trained("other", "seed=5"))],
-    "export:checkpoint": lambda walk: [str(walk.trained("run") / "checkpoints/000003.pt")],
-    "export_check:file": lambda walk: [str(walk.exported("other", "seed=5"))],
-    "deploy:bundle": lambda walk: [str(walk.exported("other", "seed=5"))],
-    "deploy:rate": lambda walk: [100.0],
-    "deploy:lie_down": lambda walk: [0.0],
-    "sim:address": lambda walk: ["127.0.0.1:18007"],
-    "sim:tile": lambda walk: [[1, 1]],
-    "sim:seconds": lambda walk: [1.0],
-    "sim:effect": lambda walk: [{"coulomb": {"bound": 0.4}}],
-    "list:group": lambda walk: ["reward"],
-    "bench:overrides": lambda walk: [["sim.physics_dt=0.004"]],
+OTHER: dict[str, Any] = {
+    **given("""
+        train:backend.threads=2 train:torch_threads=2 train:device=cuda train:start_from=paper
+        train:actuator.period=resample eval:physics_dt=0.0025 eval:measures=[stride_rate]
+        play:out=other.gif play:physics_dt=0.0025 record:excitation=[steps]
+        record_import:source=so101_arm record_import:drop=impossible
+        fit-actuator:gains=[20.0,0.5] fit-actuator:inputs=[position_error] fit-actuator:period=0.004
+        fit-actuator:smoothing=0.02
+        gap:stage=localise gap:search.min_share=1.0 gap:search.adequate=1.0e+6 gap:search.material=1.0e+6 gap:accept=1.0
+        gap:search.confirm_fraction=0.5 gap:search.certified=0.0 gap:search.max_rows=64
+        deploy:rate=100.0 deploy:lie_down=0.0 sim:address=127.0.0.1:18007 sim:tile=[1,1] sim:seconds=1.0
+        list:group=reward bench:overrides=[sim.physics_dt=0.004]
+    """),
+    "gap:search.alpha": 1e-5,  # no p-value is a tenfold of that
+    "train:logger.wandb": {"project": "p", "mode": "offline", "group": None, "entity": None},
+    **{key: {"coulomb": {"bound": 0.4}} for key in ("train:effect", "record:effect", "sim:effect")},
+    "record_import:options": {"rate_hz": 100.0},
+    "record_import:columns": {"q_hip": "jpos1"},
 }
 """Other values of leaves where ``other_values`` could not guess one."""
+
+MADE: dict[str, Callable[[Walk], Path]] = {
+    "train:resume": lambda walk: walk.trained("resumed"),
+    "train:actuator.file": lambda walk: walk.net(1),
+    **dict.fromkeys(("record:run", "eval:run", "play:run", "export:run"), lambda walk: walk.trained("other", "seed=5")),
+    **dict.fromkeys(
+        ("eval:checkpoint", "play:checkpoint", "export:checkpoint"),
+        lambda walk: walk.trained("run") / "checkpoints/000003.pt",
+    ),
+    **dict.fromkeys(("export_check:file", "deploy:bundle"), lambda walk: walk.exported("other", "seed=5")),
+    "record_audit:files": lambda walk: walk.recorded("lossy", {"sensors.dropped": 0.3}),
+    "record_import:path": lambda walk: walk.logs(1),
+    "fit-actuator:recordings": lambda walk: walk.recorded("noisy", {**FIVE, "sensors.qd.noise": 0.3}),
+    "gap:logs": lambda walk: walk.recorded("stiff", {**HELD, "effect": {"viscous": {"damping": 0.6}}}),
+}
+"""The same where the value is a file or folder."""
 
 
 FIVE: dict[str, Any] = {"seeds": [0, 1, 2, 3, 4], "physics_dt": 0.002}
@@ -491,8 +436,9 @@ def with_other_term(container: dict[str, Any], key: str) -> Iterator[dict[str, A
 def variants(program: str, container: dict[str, Any], key: str, walk: Walk) -> dict[str, list[dict[str, Any]]]:
     """Changed configurations by what is changed: the leaf, or one element of it. One of each must make a difference."""
     value = get(resolved(container), key)
-    if special := OTHER.get(f"{program}:{key}"):
-        return {key: [put(container, key, v) for v in special(walk)]}
+    if (path := f"{program}:{key}") in {**OTHER, **MADE}:
+        other = OTHER[path] if path in OTHER else str(MADE[path](walk))
+        return {key: [put(container, key, [other] if key == "files" else other)]}
     if key == "policy":  # in place of a run
         return {key: [put(put(container, "run", None), key, "paper")]}
     if value == {}:
@@ -1264,7 +1210,7 @@ def test_exemptions_are_needed() -> None:
 
 def test_the_tables_hold_no_keys_that_are_gone() -> None:
     known = {f"{leaf.program}:{leaf.key}" for leaf in LEAVES}
-    mentioned = {f"{program}:{key}" for program, values in SMALL.items() for key in values} | set(OTHER)
+    mentioned = {f"{program}:{key}" for program, values in SMALL.items() for key in values} | {*OTHER, *MADE}
     assert not stale(mentioned, known)
 
 

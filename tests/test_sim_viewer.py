@@ -59,6 +59,9 @@ class Here:
             self.server.tick()
             if k % 20 == 19:
                 self.show.tick()
+        return self.seen()
+
+    def seen(self) -> SimView:
         self.show.tick()
         view = self.show.view()
         assert view is not None
@@ -176,10 +179,7 @@ def test_the_timing_of_the_client_is_that_of_its_packets(here: Here, monkeypatch
     here.server.peer = ("127.0.0.1", 5)
     for k, at in enumerate(np.cumsum(np.r_[now - 0.9, np.full(99, 0.004), 0.030, np.full(9, 0.004)])):
         here.probe._hear(float(at), b"%d" % (k // 5))  # each command five times: a cycle of 20 ms
-    here.show.tick()
-    view = here.show.view()
-    assert view is not None
-    p = view
+    p = here.seen()
     assert (p.every.p50, p.every.worst) == (pytest.approx(4.0), pytest.approx(30.0))
     assert (p.new.p50, p.new.worst) == (pytest.approx(20.0), pytest.approx(46.0))
     assert len(p.new.interval) == 110 / 5 - 1
@@ -196,10 +196,7 @@ def test_intervals_rate_and_who_speaks_are_seen_as_they_happen(here: Here) -> No
     here.clients[1].sendto(STAND, here.server.address)
     here.clients[0].sendto(b"x", here.server.address)
     here.server.tick()
-    here.show.tick()
-    view = here.show.view()
-    assert view is not None
-    p = view
+    p = here.seen()
     assert p.frame.peer == f"127.0.0.1:{here.clients[0].getsockname()[1]}"
     assert p.frame.connected
     assert p.frame.refused == {STRANGER: 1, "wrong size": 1}

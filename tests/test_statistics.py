@@ -26,48 +26,40 @@ from go1exp.evaluate.statistics.intervals import (
     share_interval,
     stratified_mean_interval,
 )
-from go1exp.evaluate.statistics.runs import (
-    clustered_share,
-    iqm,
-    iqm_band,
-    iqm_interval,
-    pooled_share,
-    share_bootstrap,
-    verdict_by_interval,
-)
 
 Floats = NDArray[np.float64]
+SAME = "no significant difference"
 
 # ---------------------------------------------------------------------- interquartile mean
 
 
 def test_the_interquartile_mean_is_the_mean_of_the_middle_half() -> None:
-    assert float(iqm([100.0, 1.0, 2.0, 3.0, -50.0])) == 2.0
-    assert float(iqm(np.arange(8.0))) == 3.5
-    assert float(iqm([1.0, 2.0, 6.0])) == 3.0  # of three, nothing is cut
-    assert iqm([[0.0, 1.0], [2.0, 3.0]], axis=0).tolist() == [1.0, 2.0]
+    assert float(compare.iqm([100.0, 1.0, 2.0, 3.0, -50.0])) == 2.0
+    assert float(compare.iqm(np.arange(8.0))) == 3.5
+    assert float(compare.iqm([1.0, 2.0, 6.0])) == 3.0  # of three, nothing is cut
+    assert compare.iqm([[0.0, 1.0], [2.0, 3.0]], axis=0).tolist() == [1.0, 2.0]
 
 
 def test_with_three_runs_the_interval_is_students() -> None:
     values = np.array([1.0, 2.0, 4.0])
     half = stats.t.ppf(0.975, 2) * values.std(ddof=1) / math.sqrt(3)
-    got = iqm_interval(values)
+    got = compare.iqm_interval(values)
     assert got.n == 3
     assert got.estimate == pytest.approx(7 / 3)
     assert got.high - got.estimate == pytest.approx(half, rel=0.02)  # its critical value is simulated
 
 
 def test_an_interval_needs_two_runs_and_leaves_out_what_is_undefined() -> None:
-    assert math.isnan(iqm_interval([1.0]).low)
-    assert iqm_interval([]).n == 0
-    assert iqm_interval([1.0, math.nan, 3.0]) == iqm_interval([1.0, 3.0])
+    assert math.isnan(compare.iqm_interval([1.0]).low)
+    assert compare.iqm_interval([]).n == 0
+    assert compare.iqm_interval([1.0, math.nan, 3.0]) == compare.iqm_interval([1.0, 3.0])
 
 
 def test_a_band_is_the_interval_at_each_time() -> None:
     values = np.random.default_rng(0).normal(size=(7, 4))
-    middle, low, high = iqm_band(values)
+    middle, low, high = compare.iqm_band(values)
     for k in range(4):
-        one = iqm_interval(values[:, k])
+        one = compare.iqm_interval(values[:, k])
         assert (one.estimate, one.low, one.high) == pytest.approx((middle[k], low[k], high[k]))
 
 
@@ -121,8 +113,8 @@ def test_intervals_within_strata_hold_the_truth_in_nineteen_of_twenty_studies() 
 def test_the_examples_of_rliable_give_its_numbers() -> None:
     """Of rliable 1.2.0: tests/rliable/metrics_test.py for the points, and tests/library_test.py for the scores."""
     x, y = np.array([[1, 2], [2, 2], [1, 1], [2, 1]]), np.array([[1, 1], [2, 2], [3, 3]])
-    assert float(iqm(x, None)) == 1.5
-    assert float(iqm(y, None)) == 2.0
+    assert float(compare.iqm(x, None)) == 1.5
+    assert float(compare.iqm(y, None)) == 2.0
     assert compare.probability_of_improvement(x, y) == pytest.approx(1 / 3)
     scores = np.arange(80.0).reshape(5, 16)
     assert compare.probability_of_improvement(scores, scores + 10.0) == pytest.approx(0.4)
@@ -133,24 +125,24 @@ def test_the_examples_of_rliable_give_its_numbers() -> None:
 
 def test_runs_that_fall_alike_have_students_wilson_interval() -> None:
     """Without more spread than chance gives, only the quantile differs from Wilson's: none fell in the closed form."""
-    got = clustered_share([0, 0, 0], [40, 40, 40])
+    got = compare.clustered_share([0, 0, 0], [40, 40, 40])
     z2 = stats.t.ppf(0.975, 2) ** 2
     assert (got.estimate, got.low, got.n) == (0.0, 0.0, 3)
     assert got.high == pytest.approx(z2 / (120 + z2))
 
 
 def test_runs_of_which_one_falls_always_tell_little() -> None:
-    alike, apart = clustered_share([10, 10, 10, 10], [40] * 4), clustered_share([40, 0, 0, 0], [40] * 4)
+    alike, apart = compare.clustered_share([10, 10, 10, 10], [40] * 4), compare.clustered_share([40, 0, 0, 0], [40] * 4)
     assert apart.estimate == alike.estimate == 0.25
     assert apart.high - apart.low > 2.0 * (alike.high - alike.low)
-    assert pooled_share([40, 0, 0, 0], [40] * 4) == share_interval(40, 160)
+    assert compare.pooled_share([40, 0, 0, 0], [40] * 4) == share_interval(40, 160)
 
 
 def test_the_bootstrap_over_runs_draws_whole_runs() -> None:
-    got = share_bootstrap([40, 0], [40, 40])
+    got = compare.share_bootstrap([40, 0], [40, 40])
     assert (got.estimate, got.low, got.high) == (0.5, 0.0, 1.0)
-    assert math.isnan(share_bootstrap([3], [40]).low)
-    assert math.isnan(clustered_share([3], [40]).low)
+    assert math.isnan(compare.share_bootstrap([3], [40]).low)
+    assert math.isnan(compare.clustered_share([3], [40]).low)
 
 
 # ---------------------------------------------------------------------- robots
@@ -222,20 +214,20 @@ def test_the_bootstrap_agrees_with_students_interval() -> None:
 @pytest.mark.parametrize("n", [3, 4, 8, 40])
 def test_of_equal_pairs_one_in_twenty_is_told_apart_by_chance(n: int) -> None:
     rng = np.random.default_rng(n)
-    words = [verdict_by_interval(paired_mean_interval(rng.normal(size=n)), "lower") for _ in range(2000)]
-    significant = sum(w != "no significant difference" for w in words)
+    words = [compare.verdict_by_interval(paired_mean_interval(rng.normal(size=n)), "lower") for _ in range(2000)]
+    significant = sum(w != SAME for w in words)
     assert stats.binomtest(significant, 2000, 0.05).pvalue > 0.001
 
 
 def test_two_pairs_are_too_few_for_a_verdict() -> None:
-    assert verdict_by_interval(paired_mean_interval(np.array([1.0, 1.01])), "lower") == "no significant difference"
-    assert verdict_by_interval(paired_mean_interval(np.array([1.0, 1.01, 1.02])), "lower") == "worse"
+    assert compare.verdict_by_interval(paired_mean_interval(np.array([1.0, 1.01])), "lower") == SAME
+    assert compare.verdict_by_interval(paired_mean_interval(np.array([1.0, 1.01, 1.02])), "lower") == "worse"
 
 
 def test_pairs_that_all_differ_alike_tell_nothing_and_equal_pairs_are_equal() -> None:
     same = paired_mean_interval([0.41 - 0.35, 0.43 - 0.37])  # kicks are timed by the policy's period
     assert same.estimate == pytest.approx(0.06)
-    assert verdict_by_interval(same, "lower") == "no significant difference"
+    assert compare.verdict_by_interval(same, "lower") == SAME
     assert pairs_needed([0.41 - 0.35, 0.43 - 0.37]) is None
     none = paired_mean_interval([0.0, 0.0, 0.0])
     assert (none.estimate, none.low, none.high) == (0.0, 0.0, 0.0)
@@ -269,12 +261,15 @@ def test_the_pairs_that_would_tell_do_tell() -> None:
 
 
 def test_words_of_differences() -> None:
-    assert verdict_by_interval(Interval(0.2, 0.1, 0.3, 9), "higher") == "better"
-    assert verdict_by_interval(Interval(0.2, 0.1, 0.3, 9), "lower") == "worse"
-    assert verdict_by_interval(Interval(-0.2, -0.3, -0.1, 9), "lower") == "better"
-    assert verdict_by_interval(Interval(0.0, -0.1, 0.1, 9), "lower") == "no significant difference"
-    assert verdict_by_interval(Interval(0.1, math.nan, math.nan, 1), "lower") == "no significant difference"
-    assert verdict_by_interval(Interval(0.0, 0.0, 0.0, 9), "lower") == "no significant difference"
+    assert compare.verdict_by_interval(Interval(0.2, 0.1, 0.3, 9), "higher") == "better"
+    assert compare.verdict_by_interval(Interval(0.2, 0.1, 0.3, 9), "lower") == "worse"
+    assert compare.verdict_by_interval(Interval(-0.2, -0.3, -0.1, 9), "lower") == "better"
+    for low, high in ((-0.1, 0.1), (math.nan, math.nan), (0.0, 0.0)):
+        assert compare.verdict_by_interval(Interval(0.0, low, high, 9), "lower") == SAME
+    # With p values they need both a small one and a direction.
+    assert compare.verdict_by_p(-0.1, 0.01, "lower") == "better"
+    assert compare.verdict_by_p(-0.1, 0.01, "higher") == "worse"
+    assert compare.verdict_by_p(-0.1, 0.06, "lower") == compare.verdict_by_p(-0.1, math.nan, "lower") == SAME
 
 
 # ---------------------------------------------------------------------- two groups
@@ -343,13 +338,6 @@ def test_the_runs_needed_are_those_of_the_normal_approximation() -> None:
     assert compare.runs_needed(a, a + 100.0) == 4
 
 
-def test_words_need_both_a_small_p_and_a_direction() -> None:
-    assert compare.verdict_by_p(-0.1, 0.01, "lower") == "better"
-    assert compare.verdict_by_p(-0.1, 0.01, "higher") == "worse"
-    assert compare.verdict_by_p(-0.1, 0.06, "lower") == "no significant difference"
-    assert compare.verdict_by_p(-0.1, math.nan, "lower") == "no significant difference"
-
-
 # ---------------------------------------------------------------------- association
 
 
@@ -401,14 +389,14 @@ def coverage(interval: Callable[[], Interval], truth: float) -> float:
 def test_intervals_hold_the_truth_in_nineteen_of_twenty_studies(n: int, shape: str) -> None:
     rng = np.random.default_rng(12)
     draw, truth = SHAPES[shape]
-    assert 0.93 <= coverage(lambda: iqm_interval(draw(rng, n)), truth) <= 0.97
+    assert 0.93 <= coverage(lambda: compare.iqm_interval(draw(rng, n)), truth) <= 0.97
 
 
 @pytest.mark.parametrize(("n", "measured"), [(3, 0.924), (5, 0.918), (10, 0.942)])
 def test_intervals_of_evenly_spread_runs_hold_the_truth_as_often_as_the_document_says(n: int, measured: float) -> None:
     """With 3 and 5 runs that is less than the 93 % that they should have; the document has 4,000 studies."""
     rng = np.random.default_rng(12)
-    assert coverage(lambda: iqm_interval(rng.uniform(size=n)), 0.5) == pytest.approx(measured, abs=0.02)
+    assert coverage(lambda: compare.iqm_interval(rng.uniform(size=n)), 0.5) == pytest.approx(measured, abs=0.02)
     assert f"{100 * measured:.1f} (" in (data_root() / "docs/notebook/studies.md").read_text()
 
 
@@ -421,8 +409,8 @@ def test_intervals_of_falls_hold_the_truth_where_runs_differ() -> None:
         rates = rng.beta(mean * spread, (1 - mean) * spread, size=10)
         return rng.binomial(100, rates), [100] * 10
 
-    assert 0.93 <= coverage(lambda: clustered_share(*study()), mean) <= 0.97
-    assert coverage(lambda: pooled_share(*study()), mean) < 0.75  # why Wilson's alone will not do
+    assert 0.93 <= coverage(lambda: compare.clustered_share(*study()), mean) <= 0.97
+    assert coverage(lambda: compare.pooled_share(*study()), mean) < 0.75  # why Wilson's alone will not do
 
 
 def test_the_test_of_two_groups_is_wilcoxons() -> None:
