@@ -8,7 +8,6 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-import torch
 
 from go1exp import robot
 from go1exp.config.compose import compose
@@ -19,29 +18,6 @@ from go1exp.sim.physics.mujoco_cpu import MujocoCpu
 from go1exp.sim.task import TaskConfig, parse_task, parse_train
 
 STILL = ("rand=none", "event=none", "termination=none", "command=forward")
-
-
-def sunk_by(core: Go1Core) -> float:
-    """Deepest that a foot gets below the ground while a robot falls from 5 cm and lands, m."""
-    core.reset()
-    core.backend.qpos[:, 2] += 0.05
-    blocks, deepest = core.backend.sensors, 0.0
-
-    def listen(target: torch.Tensor) -> None:
-        nonlocal deepest
-        height = core.backend.sensordata[:, blocks.foot_pos_w].reshape(4, 3)[:, 2]
-        deepest = max(deepest, robot.FOOT_RADIUS - float(height.min()))
-
-    core.plant.observer = listen
-    for _ in range(20):
-        core.step(torch.zeros(1, robot.NUM_JOINTS))
-    return deepest
-
-
-def test_feet_sink_as_the_square_of_the_time_constant(make_core: Callable[..., Go1Core]) -> None:
-    soft, stiff = (sunk_by(make_core(*STILL, f"contact={name}", num_envs=1)) for name in ("soft", "stiff"))
-    assert stiff < 0.004
-    assert soft > 4.0 * stiff
 
 
 @pytest.mark.parametrize(

@@ -777,19 +777,6 @@ def test_an_action_that_is_not_finite_is_a_fault_that_names_the_action(start_cor
     assert np.isnan(caught.value.dump["action"]).tolist() == [k == 5 for k in range(12)]
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_a_reward_that_is_not_finite_is_a_fault_that_names_the_term(
-    make_task: Callable[..., TaskConfig], value: float
-) -> None:
-    terms = (only("well", lambda s: torch.ones(2)), only("sick", lambda s: torch.tensor([1.0, value])))
-    core = Go1Core(dataclasses.replace(make_task("backend.threads=1", *QUIET), reward=terms), 2)
-    core.reset()
-    with pytest.raises(NumericalFault) as caught:
-        core.check(core.step(torch.zeros(2, 12)))
-    assert caught.value.quantity == "reward.sick"
-    assert "environment 1" in str(caught.value)
-
-
 def test_an_observation_that_is_not_finite_is_a_fault_even_when_its_episode_ends(
     make_task: Callable[..., TaskConfig],
 ) -> None:

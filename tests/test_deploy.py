@@ -333,16 +333,6 @@ def test_the_same_walk_gives_the_same_numbers(bundle: str, tmp_path: Path) -> No
     assert one.account["link"]["lost"] > 5
 
 
-def test_delay_and_loss_are_in_the_log_as_the_robot_lived_them(bundle: str, tmp_path: Path) -> None:
-    done = play(bundle, tmp_path, job={"sim": {"delay": 0.006, "loss": 0.05, "noise": 0.0}})
-    assert done.status == 0
-    assert done.account["link"]["lost"] > 5
-    had = {round(clock / TICK): target for clock, target, _ in done.world.targets}
-    r = done.recording
-    assert len(r.t) < 590
-    assert r.joint("q_target").tobytes() == np.array([had[round(t / TICK)] for t in r.t]).tobytes()
-
-
 @pytest.mark.parametrize("rate", [100.0, 200.0, 400.0])
 def test_another_rate_is_the_policys(bundle: str, tmp_path: Path, rate: float) -> None:
     done = play(bundle, tmp_path, rate=rate, seconds=0.2)

@@ -92,11 +92,8 @@ EXEMPT = {
     **{
         f"{verb}.yaml:{key}": reason
         for verb, keys, reason in (
-            (
-                "tune",
-                "space overrides trials workers metric direction average warmup prune storage seed out",
-                "test_tune",
-            ),
+            ("tune", "space overrides trials workers metric direction average warmup", "test_tune"),
+            ("tune", "prune storage seed out", "test_tune"),
             ("deploy", "motion gains", "of a suspended robot: test_played"),
             ("deploy", "address check", "of robot=go1: test_go1_walk"),
             ("deploy", "feet", "of sensors that count: test_go1_walk"),
@@ -889,7 +886,6 @@ def audit_trace(container: dict[str, Any], walk: Walk) -> Trace:
 
 
 def import_trace(container: dict[str, Any], walk: Walk) -> Trace:
-
     yield from recorded(outcome("record_import", container, walk)[1])
 
 
@@ -1022,7 +1018,6 @@ def sim_trace(container: dict[str, Any], walk: Walk) -> Trace:
 
 
 def list_trace(container: dict[str, Any], walk: Walk) -> Trace:
-
     yield "output", outcome("list", container, walk)[0]
 
 
@@ -1253,40 +1248,22 @@ def test_new_keys_are_found_and_old_exemptions_too(tmp_path: Path) -> None:
     (tmp_path / "reward/some.yaml").write_text("gait: {weight: 1.0, list: [1, 2]}\nempty: {}\n")
     (tmp_path / "reward/none.yaml").write_text("{}\n")
     names = [leaf.name for leaf in read_leaves(tmp_path)]
-    assert names == [
-        "reward/some.yaml:reward.gait.weight",
-        "reward/some.yaml:reward.gait.list",
-        "reward/some.yaml:reward.empty",
-        "train.yaml:sim.new",
-        "train.yaml:hydra.job.name",
-    ]
+    of_reward = [f"reward/some.yaml:reward.{key}" for key in ("gait.weight", "gait.list", "empty")]
+    assert names == [*of_reward, "train.yaml:sim.new", "train.yaml:hydra.job.name"]
     assert [name for name in names if exemption(name)] == ["train.yaml:hydra.job.name"]
-    assert stale(["train.yaml:hydra", "train.yaml:sim.old", "reward/some.yaml:reward.gait"], names) == [
-        "train.yaml:sim.old"
-    ]
+    old = "train.yaml:sim.old"
+    assert stale(["train.yaml:hydra", old, "reward/some.yaml:reward.gait"], names) == [old]
 
 
-@pytest.mark.parametrize(
-    ("a", "b", "equal"),
-    [
-        (1.0, 1.0 + 1e-8, True),
-        (1.0, 1.001, False),
-        (float("nan"), float("nan"), True),
-        (torch.zeros(3), torch.zeros(3), True),
-        (torch.zeros(3), torch.zeros(4), False),
-        ({"x": [1.0]}, {"x": [1.0]}, True),
-        ({"x": [1.0]}, {"x": [2.0]}, False),
-        ({"x": 1}, {"y": 1}, False),
-        ([1.0], [1.0, 1.0], False),
-        (None, 1.0, False),
-        ("a", "b", False),
-    ],
-)
-def test_same(a: Any, b: Any, equal: bool) -> None:
-    assert same(a, b) == equal
+ALIKE: list[tuple[Any, Any]] = [(1.0, 1.0 + 1e-8), (float("nan"),) * 2, (torch.zeros(3),) * 2, ({"x": [1.0]},) * 2]
+OTHER_THAN: list[tuple[Any, Any]] = [
+    *((1.0, 1.001), (torch.zeros(3), torch.zeros(4)), ({"x": [1.0]}, {"x": [2.0]}), ({"x": 1}, {"y": 1})),
+    *(([1.0], [1.0, 1.0]), (None, 1.0), ("a", "b")),
+]
 
 
-def test_a_trace_that_ends_early_is_different() -> None:
+def test_what_is_compared_is_alike_up_to_rounding_and_a_trace_that_ends_early_is_different() -> None:
+    assert [same(a, b) for a, b in ALIKE + OTHER_THAN] == [True] * len(ALIKE) + [False] * len(OTHER_THAN)
     assert difference([("x", 1)], [("x", 1)]) is None
     assert difference([("x", 1), ("y", 2)], [("x", 1)]) == "y"
     assert difference([("x", 1)], [("x", 1), ("y", 2)]) == "end"

@@ -27,6 +27,7 @@ from go1exp.config.compose import compose
 from go1exp.config.schema.joint_values import JointValues, numbers, spread
 from go1exp.config.schema.physics import MUJOCO_CONTACT
 from go1exp.config.schema.registry import Entry, Term, bind, members
+from go1exp.extend.testing.actuators import _core, _plain, _probe, _run, kind
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.effects.base import LAST, Effect, Measured, Param
 from go1exp.sim.effects.rules import on_mount
@@ -164,18 +165,9 @@ def sizes(entry: Entry) -> list[Param]:
     return [p for p in kind(entry).params if p.tolerance != math.inf]
 
 
-def kind(entry: Entry) -> type[Effect]:
-    assert isinstance(entry.target, type)
-    assert issubclass(entry.target, Effect)
-    return entry.target
-
-
 def probe(entry: Entry, p: Param) -> float:
     """Return a sensible value that is not null: five tolerances, as far as the bounds go."""
-    step = 5.0 * p.tolerance
-    return PROBES.get(
-        (entry.name, p.name), min(p.null + step, p.high) if p.null < p.high else max(p.null - step, p.low)
-    )
+    return PROBES.get((entry.name, p.name), _probe(p.null, p.low, p.high, 5.0 * p.tolerance))
 
 
 def probes(entry: Entry) -> dict[str, float]:
@@ -340,34 +332,12 @@ def test_ranks_of_nominal_effects_differ() -> None:
 # ---------------------------------------------------------------------- absence
 
 
-def core_readings(effects: tuple[Term, ...], steps: int) -> list[Tensor]:
-    """Let trained-for robots tumble through short episodes, with all the configured randomness but noise."""
-    short = dataclasses.replace(task().sim, episode_s=0.16)
-    core = Go1Core(dataclasses.replace(task(), sim=short, effect=effects), 2, seed=5, noise=False)
-    assert [type(e) for e in core.plant.effects.effects.values()] == [t.entry.target for t in effects]
-    read = [core.reset().clone()]
-    for k in range(steps):
-        action = 4.0 * torch.sin(0.9 * k + torch.arange(24.0).reshape(2, 12))
-        result = core.step(action)
-        read += [result.observation, result.final_observation, result.reward, core.backend.qpos, core.backend.qvel]
-        read = [*read[:-5], *(x.clone() for x in read[-5:]), core.plant.torque.clone()]
-    return read
-
-
-@cache
-def plain_core() -> list[Tensor]:
-    return core_readings((), 12)
-
-
-@each
-def test_an_absent_effect_changes_no_bit_on_the_stand(entry: Entry) -> None:
-    for held in places(entry):
-        assert same(plain(held, 100), Rig(1, [term(entry.name, {})], held=held).run(100)) == []
-
-
 def test_all_effects_absent_together_change_no_bit() -> None:
-    found = core_readings(tuple(term(name, {}) for name in EFFECTS), 12)
-    assert all(torch.equal(a, b) for a, b in zip(plain_core(), found, strict=True))
+    """One by one: ``check_effect``."""
+    core = _core(tuple(term(name, {}) for name in EFFECTS), 2)
+    assert [type(e) for e in core.plant.effects.effects.values()] == [e.target for e in EFFECTS.values()]
+    core.reset()
+    assert all(torch.equal(a, b) for a, b in zip(_plain(10), _run(core, 10), strict=True))
 
 
 @pytest.mark.parametrize("name", [n for n, e in EFFECTS.items() if overrides(e, "on_gears") or overrides(e, "reset")])

@@ -22,10 +22,11 @@ EVERY = [entry for group in groups() for entry in members(group).values() if ent
 
 NULL: dict[str, dict[str, Any]] = {
     "foot_friction": {"range": (1.0, 1.0), "operation": "scale"},
+    "ground_stiffness": {"range": (0.02, 0.02)},
     "center_of_mass": {"range": (0.0, 0.0)},
     "link_mass": {"range": (1.0, 1.0)},
 }
-"""Parameters of model terms at which the robot stays the nominal one; those of state terms have a range of zero."""
+"""Of model terms: at these the robot stays the nominal one; of state terms: a range of zero."""
 
 ROUNDS = ("net",)
 """Terms that multiply matrices."""
