@@ -119,7 +119,7 @@ def about(period: float) -> Metadata:
 
 @pytest.mark.parametrize("cycles", [1, 4])
 def test_what_a_policy_remembers_is_a_training_period_old(cycles: int) -> None:
-    """Four cycles in a training period: it sees the angle of now, of 4 and of 8 cycles ago, and its action of 4 ago."""
+    """Four cycles in a training period: it sees the angle of now, of 4 and of 8 cycles ago, and its mean action of 4."""
     memory = PolicyMemory(about(0.02), 0.02 / cycles)
 
     def policy(given: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -130,7 +130,7 @@ def test_what_a_policy_remembers_is_a_training_period_old(cycles: int) -> None:
     for k, q in enumerate(angle):
         seen = memory(policy, {"joint_pos": np.array([[q]], np.float32)})["observation"][0]  # type: ignore[arg-type]
         ago = [angle[max(k - n * cycles, 0)] for n in (0, 1, 2)]
-        assert seen.tolist() == [*ago, angle[k - cycles] if k >= cycles else 0.0]
+        assert seen.tolist() == [*ago, sum(angle[max(k - cycles, 0) : k]) / cycles]
 
 
 def test_a_bundle_of_another_version_has_no_history() -> None:

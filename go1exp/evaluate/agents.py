@@ -147,32 +147,33 @@ class _RunningPolicy:
     def __init__(self, agent: PolicyAgent, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> None:
         self._policy, self._core = agent.policy, core
         self._filter = EstimatedVelocity(core, core.noise, seed) if trunk_velocity == "estimated" else None
-        # A policy that runs faster than it was trained sees its action, and frames, of one training period ago.
-        self._past = Past[tuple[Tensor, Tensor]](agent.task.sim.policy_dt, core.task.sim.policy_dt)
-        self._columns = columns(core.task, "previous_action") if self._past.cycles > 1 else None
+        # A policy that runs faster than it was trained: its mean action and its frames of a training period (``Past``).
+        periods = agent.task.sim.policy_dt, core.task.sim.policy_dt
+        self._actions, self._frames = Past[Tensor](*periods), Past[Tensor](*periods)
+        self._columns = columns(core.task, "previous_action") if self._actions.cycles > 1 else None
         self._history = history_columns(core.task.observation)
-        self._remembered: tuple[Tensor, Tensor] | None = None
+        self._previous: Tensor | None = None
+        self._earlier: Tensor | None = None
 
     def __call__(self, observation: Tensor) -> Tensor:
-        if self._past.cycles == 1 and self._filter is None:
+        if self._actions.cycles == 1 and self._filter is None:
             return self._policy(observation)
         observation = observation.clone() if self._filter is None else self._filter.put(observation)
         if self._columns is not None:
-            observation[:, self._columns] = 0.0 if self._remembered is None else self._remembered[0]
-        history, kept = self._history, self._remembered
-        observation[:, history.earlier] = observation[:, history.newest] if kept is None else kept[1]
+            observation[:, self._columns] = 0.0 if self._previous is None else self._previous
+        history = self._history
+        observation[:, history.earlier] = observation[:, history.newest] if self._earlier is None else self._earlier
         action = self._policy(observation)
         clip = self._core.task.action.clip
-        newest = action.clamp(-clip, clip), observation[:, history.carried]
-        first = torch.zeros_like(action), observation[:, history.earlier]
-        self._remembered = self._past.after(newest, first if kept is None else kept)
+        self._previous = self._actions.mean(action.clamp(-clip, clip))
+        self._earlier = self._frames.after(observation[:, history.carried], observation[:, history.earlier])
         return action
 
     def save(self) -> Any | None:
-        return None if self._filter else copy.deepcopy((self._past, self._remembered))
+        return None if self._filter else copy.deepcopy((self._actions, self._frames, self._previous, self._earlier))
 
     def load(self, state: Any) -> None:
-        self._past, self._remembered = copy.deepcopy(state)
+        self._actions, self._frames, self._previous, self._earlier = copy.deepcopy(state)
 
 
 @dataclass(frozen=True)

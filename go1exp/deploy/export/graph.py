@@ -46,7 +46,7 @@ READINGS = (
     Port("joint_torque", J, "N m", "joint", "torques reported by the motors"),
     Port("joint_target", J, "rad", "joint", "present position targets; the nominal stance at the start"),
     Port("command", 3, "m/s, m/s, rad/s", "trunk", "commanded velocity: x, y and yaw rate"),
-    Port("previous_action", J, "1", "joint", "the output `action` one training period ago; zero before"),
+    Port("previous_action", J, "1", "joint", "mean of the output `action` over the last training period; 0 before it"),
     Port("walked", 1, "s", "-", "time since walking began: a gait clock is a function of it"),
 )
 """Inputs that the robot's computer can provide. A graph has those that its terms read, in this order."""
@@ -75,7 +75,7 @@ LAWS: dict[str, Callable[[Tensor], Tensor]] = {
 OUTPUTS = (
     Port("joint_target", J, "rad", "joint", "position targets for the motors"),
     Port("observation", 0, "as each term", "-", "input of the network: the concatenated terms"),
-    Port("action", J, "1", "joint", "the network's output, clipped: `previous_action` one training period later"),
+    Port("action", J, "1", "joint", "the network's output, clipped; `previous_action` is its mean over a training period"),
 )
 """Outputs of the graph; the observation's size is the policy's."""
 

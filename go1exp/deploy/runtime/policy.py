@@ -105,7 +105,7 @@ A = TypeVar("A", bound=Any)  # an array of NumPy or torch
 
 
 class Past(Generic[A]):
-    """Buffer of the values of one training period.
+    """Values of the last training period of a policy that may run faster than it was trained.
 
     Args:
         trained: period of the policy in training, s.
@@ -123,6 +123,14 @@ class Past(Generic[A]):
         """Add a value; return that of one training period before the next cycle, ``before`` if there is none."""
         self._kept.append(newest)
         return before if len(self._kept) < self.cycles else self._kept[0]
+
+    def mean(self, newest: A) -> A:
+        """Add a value; return the mean over the last training period, with 0 before the first value.
+
+        Of actions: that of one training period ago would let the cycles between two of them go separate ways.
+        """
+        self._kept.append(newest)
+        return sum(self._kept) / self.cycles
 
 
 class PolicyMemory:
@@ -153,7 +161,7 @@ class PolicyMemory:
             readings["past"] = self.values["past"] = self._first
         outputs = policy(readings)
         if "previous_action" in self.values:
-            self.values["previous_action"] = self._actions.after(outputs["action"], 0.0 * outputs["action"])
+            self.values["previous_action"] = self._actions.mean(outputs["action"])
         if self._first is not None:
             self.values["past"] = self._frames.after(outputs["observation"][:, self._columns.carried], self._first)
         return outputs
