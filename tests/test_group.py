@@ -42,7 +42,7 @@ def alone(config: TrainConfig) -> DevicePPO:
     changing = {ramp.path for ramp in config.schedule.values()}
     core = Go1Core(config.task, config.ppo.num_envs, 0, spread_starts=True, critic=True, changing=changing)
     ppo = DevicePPO(config.ppo, Go1VecEnv(core), 0, "cpu")
-    ppo.schedule = Schedule(config.schedule, core, config.ppo.num_envs * config.ppo.steps)
+    ppo.schedule = Schedule(config.schedule, core, config.ppo.num_envs * config.ppo.steps, config.ppo.iterations)
     ppo.after_iteration = lambda ppo: ppo.schedule.advance(ppo.num_timesteps, {})
     return ppo
 

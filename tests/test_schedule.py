@@ -85,8 +85,9 @@ def test_an_optional_ramp_is_left_out_of_a_task_without_its_setting() -> None:
     assert set(train_config("actuator=pd", "command=paper", *ramps).schedule) == set()
 
 
-def test_a_ramp_may_count_iterations() -> None:
-    _, schedule = built(ramp(f"{WEIGHT}, start: 2, over: 4, unit: iterations"))
+@pytest.mark.parametrize("times", ["start: 2, over: 4, unit: iterations", "start: 0.2, over: 0.4, unit: share"])
+def test_a_ramp_may_count_iterations_or_shares_of_the_training(times: str) -> None:
+    _, schedule = built(ramp(f"{WEIGHT}, {times}"), "ppo.iterations=10")
     values = []
     for iteration in range(8):
         schedule.advance(iteration * STEPS, {})

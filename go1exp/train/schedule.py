@@ -35,7 +35,11 @@ class Schedule:
     """
 
     def __init__(
-        self, ramps: Mapping[str, Ramp] | None = None, core: Go1Core | None = None, per_iteration: int = 1
+        self,
+        ramps: Mapping[str, Ramp] | None = None,
+        core: Go1Core | None = None,
+        per_iteration: int = 1,
+        iterations: int = 1,
     ) -> None:
         """Put the first values into force.
 
@@ -43,8 +47,9 @@ class Schedule:
             ramps: by name.
             core: environment, which was built with ``changing`` of the same settings.
             per_iteration: steps of all robots together in an iteration.
+            iterations: of the whole training.
         """
-        self._per_iteration = per_iteration
+        self._unit = {"steps": 1, "iterations": per_iteration, "share": per_iteration * iterations}
         self._ramps, self._core = dict(ramps or {}), core
         self._triggers = {key: ramp.when.all() for key, ramp in self._ramps.items() if ramp.when}
         self._recent = {
@@ -89,7 +94,7 @@ class Schedule:
     def _apply(self, steps: int) -> None:
         """Write the values at ``steps`` into the environment, those that differ from the present ones."""
         for key, ramp in self._ramps.items():
-            per = self._per_iteration if ramp.unit == "iterations" else 1
+            per = self._unit[ramp.unit]
             start = self._started[key] if key in self._triggers else per * (ramp.start or 0.0)
             value = ramp.value(-math.inf if start is None else (steps - start) / per)
             if self._core is not None and self._values.get(key) != value:

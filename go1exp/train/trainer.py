@@ -140,7 +140,7 @@ def build(config: TrainConfig, group: Group | None = None) -> AdaptivePPO:
         ppo: AdaptivePPO = DevicePPO(config.ppo, Go1VecEnv(core), seed, device, group)
     else:
         ppo = AdaptivePPO(config.ppo, Go1VecEnv(core), seed, device)
-    ppo.schedule = Schedule(config.schedule, core, config.ppo.num_envs * config.ppo.steps)
+    ppo.schedule = Schedule(config.schedule, core, config.ppo.num_envs * config.ppo.steps, config.ppo.iterations)
     return ppo
 
 

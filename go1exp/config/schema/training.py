@@ -252,7 +252,8 @@ class Ramp(Strict):
         start: time after which the ramp starts, in unit; 0 without when.
         over: time that the ramp takes, in unit; 0 is a jump.
         when: start at a metric's threshold instead, {measure, below or above, iterations, also}.
-        unit: steps of all robots together, or iterations, which suit small and large batches alike.
+        unit: steps of all robots together, iterations, which suit small and large batches alike, or share, of all
+            steps that the training will make.
         optional: leave the ramp out of a task without this setting, such as a delay with actuator=pd, or
             where it is drawn for each robot.
     """
@@ -263,7 +264,7 @@ class Ramp(Strict):
     last: Annotated[Value | None, Field(alias="to")] = None
     start: NonNegative | None = None
     when: Trigger | None = None
-    unit: Literal["steps", "iterations"] = "steps"
+    unit: Literal["steps", "iterations", "share"] = "steps"
     optional: bool = False
 
     def __post_init__(self) -> None:
