@@ -119,7 +119,7 @@ def about(period: float) -> Metadata:
 
 @pytest.mark.parametrize("cycles", [1, 4])
 def test_what_a_policy_remembers_is_a_training_period_old(cycles: int) -> None:
-    """Four cycles in a training period: it sees the angle of now, of 4 and of 8 cycles ago, and its mean action of 4."""
+    """Four cycles in a training period: it sees the angles of now, 4 and 8 cycles ago, its mean action of 4."""
     memory = PolicyMemory(about(0.02), 0.02 / cycles)
 
     def policy(given: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -7,9 +7,9 @@ A name of the group is one ramp (``config/schema/training.py``)::
     delay: {set: actuator.command, from: [0.0, 0.0], to: [0.0, 0.03], start: 40e6, over: 20e6}
     stiff: {set: contact.time_constant, from: 0.02, to: 0.005, when: {measure: gait/trot_error, below: 0.1}, over: 20e6}
 
-``start`` and ``over`` count steps of all robots together, iterations, or shares of the training (``unit``). The configured
-values of ``reward``, ``actuator``, ``contact`` and ``command`` are those of a run without the schedule, and those with
-which the policy is evaluated.
+``start`` and ``over`` count steps of all robots together, iterations, or shares of the training (``unit``). The
+configured values of ``reward``, ``actuator``, ``contact`` and ``command`` are those of a run without the schedule, and
+those with which the policy is evaluated.
 """
 
 from __future__ import annotations

@@ -75,7 +75,7 @@ LAWS: dict[str, Callable[[Tensor], Tensor]] = {
 OUTPUTS = (
     Port("joint_target", J, "rad", "joint", "position targets for the motors"),
     Port("observation", 0, "as each term", "-", "input of the network: the concatenated terms"),
-    Port("action", J, "1", "joint", "the network's output, clipped; `previous_action` is its mean over a training period"),
+    Port("action", J, "1", "joint", "the network's output, clipped; `previous_action` is its recent mean"),
 )
 """Outputs of the graph; the observation's size is the policy's."""
 
