@@ -50,25 +50,15 @@ class NotComparable(Expected):
 
 @dataclass(frozen=True)
 class Comparison:
-    """Recordings beside a robot's model, ready to be scored.
+    """Recordings beside a robot's model, ready to be scored."""
 
-    Attributes:
-        robot: as it is in the recordings.
-        ready: the recordings as they are compared, settings that suit them, and what was chosen.
-        windows: the recordings cut.
-        dt: physics step, s.
-        scorer: scores models on the windows.
-        numerical: error of the physics step by quantity, SI units.
-        clock: which of two clocks the recordings are read by; None if the model says which.
-    """
-
-    robot: Robot
-    ready: Ready
-    windows: Windows
-    dt: float
-    scorer: Scorer
-    numerical: dict[str, float]
-    clock: ClockChoice | None = None
+    robot: Robot  # as it is in the recordings
+    ready: Ready  # the recordings as they are compared, settings that suit them, and what was chosen
+    windows: Windows  # the recordings cut
+    dt: float  # physics step, s
+    scorer: Scorer  # scores models on the windows
+    numerical: dict[str, float]  # error of the physics step by quantity, SI units
+    clock: ClockChoice | None = None  # which of two clocks the recordings are read by; None if the model says which
 
     @property
     def recordings(self) -> tuple[Recording, ...]:

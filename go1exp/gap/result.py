@@ -128,70 +128,43 @@ class GapSettings:
 
 @dataclass(frozen=True)
 class Floors:
-    """What no model can get below, as standard deviations.
+    """What no model can get below, as standard deviations."""
 
-    Attributes:
-        noise: sensor noise by quantity (``q`` rad, ``qd`` rad/s, ``tau_est`` N m), median over joints and episodes.
-        numerical: error of the physics step, twice what half the step changes, median of windows, by quantity.
-        repeatability: difference between repeated episodes over sqrt(2), root mean square, by quantity; None if no
-            episode was repeated.
-    """
-
+    # sensor noise by quantity (``q`` rad, ``qd`` rad/s, ``tau_est`` N m), median over joints and episodes
     noise: dict[str, float]
+    # error of the physics step, twice what half the step changes, median of windows, by quantity
     numerical: dict[str, float]
+    # difference between repeated episodes over sqrt(2), root mean square, by quantity; None if no episode was repeated
     repeatability: dict[str, float] | None
 
 
 @dataclass(frozen=True)
 class Localisation:
-    """Where the model is wrong.
+    """Where the model is wrong."""
 
-    Attributes:
-        joints: rows.
-        regimes: columns.
-        samples: (J, R) number of samples.
-        excess: (J, R) mean excess; NaN where there is no sample.
-        p: (J, R) p-values of block permutation; NaN where nothing can be said.
-        flagged: (J, R) bool, significant at a false discovery rate of 5 %.
-    """
-
-    joints: tuple[str, ...]
-    regimes: tuple[str, ...]
-    samples: np.ndarray
-    excess: np.ndarray
-    p: np.ndarray
-    flagged: np.ndarray
+    joints: tuple[str, ...]  # rows
+    regimes: tuple[str, ...]  # columns
+    samples: np.ndarray  # (J, R) number of samples
+    excess: np.ndarray  # (J, R) mean excess; NaN where there is no sample
+    p: np.ndarray  # (J, R) p-values of block permutation; NaN where nothing can be said
+    flagged: np.ndarray  # (J, R) bool, significant at a false discovery rate of 5 %
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One row of the evidence.
+    """One row of the evidence."""
 
-    Attributes:
-        effect: registered name.
-        joints: where it would act; empty for an effect of the whole robot.
-        params: parameter -> one value per joint of ``joints``, or one number.
-        excess_after: held-out excess with it.
-        log_gain: mean over held-out windows of the fall of log chi2.
-        p: sign-flip max-T p-value over all candidates.
-        size_over_tolerance: largest deviation from null over the tolerance.
-        alias_class: effects that do as well on these data, itself included.
-        status: what became of it.
-        reason: why, in a sentence.
-        stage: at which term of the stepwise search it was tested, from 1.
-    """
-
-    effect: str
-    joints: tuple[str, ...]
-    params: dict[str, list[float] | float]
-    excess_after: float
-    log_gain: float
-    p: float
-    size_over_tolerance: float
-    alias_class: tuple[str, ...]
-    status: Literal["accepted", "rejected", "alias", "not excited"]
-    reason: str
-    stage: int = 1
+    effect: str  # registered name
+    joints: tuple[str, ...]  # where it would act; empty for an effect of the whole robot
+    params: dict[str, list[float] | float]  # parameter -> one value per joint of ``joints``, or one number
+    excess_after: float  # held-out excess with it
+    log_gain: float  # mean over held-out windows of the fall of log chi2
+    p: float  # sign-flip max-T p-value over all candidates
+    size_over_tolerance: float  # largest deviation from null over the tolerance
+    alias_class: tuple[str, ...]  # effects that do as well on these data, itself included
+    status: Literal["accepted", "rejected", "alias", "not excited"]  # what became of it
+    reason: str  # why, in a sentence
+    stage: int = 1  # at which term of the stepwise search it was tested, from 1
 
 
 @dataclass(frozen=True)
@@ -221,23 +194,15 @@ class NamedEffect:
 
 @dataclass(frozen=True)
 class Overlay:
-    """One held-out window to look at: arrays over its samples, by channel (``q_FR_calf``).
+    """One held-out window to look at: arrays over its samples, by channel (``q_FR_calf``)."""
 
-    Attributes:
-        episode: where it is from.
-        t: (T,) time in the episode, s.
-        measured: (T,) by channel.
-        before: (T,) of the model within its tolerances; only channels that are compared in this window.
-        after: (T,) with what was named.
-        noise: standard deviation of the noise, by channel.
-    """
-
-    episode: str
-    t: np.ndarray
-    measured: dict[str, np.ndarray]
+    episode: str  # where it is from
+    t: np.ndarray  # (T,) time in the episode, s
+    measured: dict[str, np.ndarray]  # (T,) by channel
+    # (T,) of the model within its tolerances; only channels that are compared in this window
     before: dict[str, np.ndarray]
-    after: dict[str, np.ndarray]
-    noise: dict[str, float]
+    after: dict[str, np.ndarray]  # (T,) with what was named
+    noise: dict[str, float]  # standard deviation of the noise, by channel
 
 
 @dataclass(frozen=True)
@@ -246,23 +211,15 @@ class AngleErrors:
 
     Each pair is of the model as it is, and with what was named and the tolerances used. What the unknown initial state
     of a window explains is taken out.
-
-    Attributes:
-        windows: how many.
-        median: of all joints together.
-        removed: share of the error that is gone, median of windows.
-        worse: share of the windows that are worse.
-        by_joint: joint -> pair.
-        by_episode: episode -> pair, of all joints together.
-        within: share of the windows in which no joint is further off than accepted; None if nothing is.
     """
 
-    windows: int
-    median: tuple[float, float]
-    removed: float
-    worse: float
-    by_joint: dict[str, tuple[float, float]]
-    by_episode: dict[str, tuple[float, float]]
+    windows: int  # how many
+    median: tuple[float, float]  # of all joints together
+    removed: float  # share of the error that is gone, median of windows
+    worse: float  # share of the windows that are worse
+    by_joint: dict[str, tuple[float, float]]  # joint -> pair
+    by_episode: dict[str, tuple[float, float]]  # episode -> pair, of all joints together
+    # share of the windows in which no joint is further off than accepted; None if nothing is
     within: tuple[float, float] | None = None
 
 
@@ -272,41 +229,29 @@ class ClockChoice:
 
     Both are tested on readings of the same rows, by the same floor, on windows that no fit has seen and that are not
     of the last check. By clock: of the written times (``recorded``), and of the speeds (``speeds``).
-
-    Attributes:
-        taken: the clock that is used.
-        decided: whether held-out windows prefer it; otherwise it is the default, or the only one that is usable.
-        reason: why it is not decided; empty if it is.
-        rate_hz: clock -> least and largest rate of rows of the recordings, Hz.
-        steps: 5 % and 95 % quantile of the steps of the written times over their median; (1, 1) is an even clock.
-        windows: number of windows.
-        stretches: of neighbouring windows, which count as one in the test.
-        nominal_errors: clock -> error of the angles in the median window, rad, of the model within its tolerances.
-        errors: clock -> the same with the first terms that a search finds by that clock.
-        terms: clock -> names of these terms.
-        gain: mean over windows by how much log chi2 is larger by the written times, with those terms; positive where
-            the speeds tell the better clock.
-        interval: its 95 % interval, from resampled stretches.
-        p: two-sided sign-flip test over stretches.
-        nominal_gain: the same mean within the tolerances.
-        nominal_p: its p.
     """
 
-    taken: Clock
-    decided: bool
-    reason: str = ""
+    taken: Clock  # the clock that is used
+    decided: bool  # whether held-out windows prefer it; otherwise it is the default, or the only one that is usable
+    reason: str = ""  # why it is not decided; empty if it is
+    # clock -> least and largest rate of rows of the recordings, Hz
     rate_hz: dict[Clock, tuple[float, float]] = field(default_factory=dict)
+    # 5 % and 95 % quantile of the steps of the written times over their median; (1, 1) is an even clock
     steps: tuple[float, float] = (math.nan, math.nan)
-    windows: int = 0
-    stretches: int = 0
+    windows: int = 0  # number of windows
+    stretches: int = 0  # of neighbouring windows, which count as one in the test
+    # clock -> error of the angles in the median window, rad, of the model within its tolerances
     nominal_errors: dict[Clock, float] = field(default_factory=dict)
+    # clock -> the same with the first terms that a search finds by that clock
     errors: dict[Clock, float] = field(default_factory=dict)
-    terms: dict[Clock, tuple[str, ...]] = field(default_factory=dict)
+    terms: dict[Clock, tuple[str, ...]] = field(default_factory=dict)  # clock -> names of these terms
+    # mean over windows by how much log chi2 is larger by the written times, with those terms; positive where the speeds
+    # tell the better clock
     gain: float = math.nan
-    interval: tuple[float, float] = (math.nan, math.nan)
-    p: float = math.nan
-    nominal_gain: float = math.nan
-    nominal_p: float = math.nan
+    interval: tuple[float, float] = (math.nan, math.nan)  # its 95 % interval, from resampled stretches
+    p: float = math.nan  # two-sided sign-flip test over stretches
+    nominal_gain: float = math.nan  # the same mean within the tolerances
+    nominal_p: float = math.nan  # its p
 
 
 @dataclass(frozen=True)

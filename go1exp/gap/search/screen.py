@@ -62,19 +62,12 @@ def free_shapes(effect: str) -> tuple[Key, ...]:
 
 @dataclass(frozen=True)
 class Motion:
-    """What joints did in the recordings: where shapes and thresholds of effects are looked for.
+    """What joints did in the recordings: where shapes and thresholds of effects are looked for."""
 
-    Attributes:
-        mean: (J,) average angles, rad.
-        least: (J,) least angles.
-        largest: (J,) largest angles.
-        demand: (J,) largest torque that was asked for, over the peak torque.
-    """
-
-    mean: np.ndarray
-    least: np.ndarray
-    largest: np.ndarray
-    demand: np.ndarray
+    mean: np.ndarray  # (J,) average angles, rad
+    least: np.ndarray  # (J,) least angles
+    largest: np.ndarray  # (J,) largest angles
+    demand: np.ndarray  # (J,) largest torque that was asked for, over the peak torque
 
     def angle(self, value: float) -> np.ndarray:
         """Return what a shape's value stands for (J,) or (1,); see ``sim/effects/base.py``."""
