@@ -132,24 +132,18 @@ def test_a_column_may_become_broken_numbers_after_a_million_whole_ones(tmp_path:
 
 
 def test_without_a_clock_the_rate_makes_the_time(tmp_path: Path) -> None:
-    columns = {name: value for name, value in COLUMNS.items() if name != "t"}
-    r = imported(lay(tmp_path / "x.csv"), columns=columns, rate_hz=250.0)
+    r = imported(lay(tmp_path / "x.csv"), **mapped(t=None), rate_hz=250.0)
     np.testing.assert_allclose(r.t, K / 250.0)
     assert "No clock in the source" in r.meta.notes
 
 
 def test_a_flag_is_zero_or_one(tmp_path: Path) -> None:
-    columns = {**COLUMNS, "torque_enable": "on"}
-    text = lay(tmp_path / "x.csv").read_text().splitlines()
-    for values, right in (((0, 1), True), ((0, 2), False)):
-        lines = [text[0] + ",on", *(f"{line},{values[k % 2]}" for k, line in enumerate(text[1:]))]
-        (tmp_path / "x.csv").write_text("\n".join(lines) + "\n")
-        if right:
-            assert (
-                imported(tmp_path / "x.csv", columns=columns).channels["torque_enable"].tolist() == [False, True] * 20
-            )
-        else:
-            assert "column 'on' (for torque_enable): must be 0 or 1" in refusal(tmp_path / "x.csv", columns=columns)
+    columns, path = {**COLUMNS, "torque_enable": "on"}, tmp_path / "x.csv"
+    head, *rows = lay(path).read_text().splitlines()
+    path.write_text("\n".join([head + ",on", *(f"{row},{k % 2}" for k, row in enumerate(rows))]) + "\n")
+    assert imported(path, columns=columns).channels["torque_enable"].tolist() == [False, True] * 20
+    path.write_text(path.read_text() + f"{rows[-1].replace('1195', '1200')},2\n")
+    assert "column 'on' (for torque_enable): must be 0 or 1" in refusal(path, columns=columns)
 
 
 def test_every_quantity_has_units_of_which_the_first_is_ours() -> None:
@@ -158,8 +152,9 @@ def test_every_quantity_has_units_of_which_the_first_is_ours() -> None:
     assert UNITS["qd"]["rpm"] == pytest.approx(2 * np.pi / 60)
 
 
-def without(name: str) -> dict[str, Any]:
-    return {k: v for k, v in COLUMNS.items() if k != name}
+def mapped(**columns: Any) -> dict[str, Any]:
+    """The columns with some others; None leaves one out."""
+    return {"columns": {k: v for k, v in (COLUMNS | columns).items() if v is not None}}
 
 
 @pytest.mark.parametrize(
@@ -167,32 +162,17 @@ def without(name: str) -> dict[str, Any]:
     [
         ({"columns": None}, "importer.csv.columns: required, but not given; "),
         ({"columns": None}, "has the columns stamp, angle [deg], goal, ticks, volt"),
-        ({"columns": {**COLUMNS, "q_knee": "Angle"}}, "no column 'Angle' (for q_knee); did you mean 'angle [deg]'?"),
-        ({"columns": {**COLUMNS, "q_targt_knee": "goal"}}, "columns.q_targt_knee: unknown channel; did you mean"),
-        ({"columns": {**COLUMNS, "qdd_knee": "goal"}}, "columns.qdd_knee: unknown channel; did you mean 'qd_knee'"),
-        ({"columns": {**COLUMNS, "current": "volt"}}, "columns.current: unknown channel; channels are t, q_JOINT"),
-        (
-            {"columns": {**COLUMNS, "t": {"column": "stamp", "unit": "sec"}}},
-            "columns.t.unit = 'sec': unknown unit; s, ms",
-        ),
-        (
-            {"columns": {**COLUMNS, "q_knee": {"colum": "goal"}}},
-            "columns.q_knee.colum: unknown key 'colum'; did you mean",
-        ),
-        (
-            {"columns": {**COLUMNS, "q_knee": {"column": "goal", "scale": 0.0}}},
-            "columns.q_knee.scale = 0.0: must not be 0",
-        ),
-        ({"columns": {**COLUMNS, "q_knee": ["goal"]}}, "columns.q_knee = ['goal']: must be a name, a number or"),
-        (
-            {"columns": without("t")},
-            "importer.csv.columns: no t; name the column of the time (t: time) or give rate_hz",
-        ),
-        ({"columns": without("q_knee")}, "importer.csv.columns: no angle of a joint"),
-        (
-            {"columns": {**COLUMNS, "q_hip": "goal"}, "kd": 0.1},
-            "columns: no q_target_hip; q_target is needed of all joints",
-        ),
+        (mapped(q_knee="Angle"), "no column 'Angle' (for q_knee); did you mean 'angle [deg]'?"),
+        (mapped(q_targt_knee="goal"), "columns.q_targt_knee: unknown channel; did you mean"),
+        (mapped(qdd_knee="goal"), "columns.qdd_knee: unknown channel; did you mean 'qd_knee'"),
+        (mapped(current="volt"), "columns.current: unknown channel; channels are t, q_JOINT"),
+        (mapped(t={"column": "stamp", "unit": "sec"}), "columns.t.unit = 'sec': unknown unit; s, ms"),
+        (mapped(q_knee={"colum": "goal"}), "columns.q_knee.colum: unknown key 'colum'; did you mean"),
+        (mapped(q_knee={"column": "goal", "scale": 0.0}), "columns.q_knee.scale = 0.0: must not be 0"),
+        (mapped(q_knee=["goal"]), "columns.q_knee = ['goal']: must be a name, a number or"),
+        (mapped(t=None), "importer.csv.columns: no t; name the column of the time (t: time) or give rate_hz"),
+        (mapped(q_knee=None), "importer.csv.columns: no angle of a joint"),
+        (mapped(q_hip="goal") | {"kd": 0.1}, "columns: no q_target_hip; q_target is needed of all joints"),
         ({"joints": ["knee", "hip"], "kd": 0.1}, "columns: no q_hip; q is needed of all joints"),
         ({"joints": ["hip"], "kd": 0.1}, "columns.q_knee: unknown channel; joints are hip"),
         ({"kp": [1.0, 2.0]}, "importer.csv.kp: 2 values for 1 joints"),
@@ -234,10 +214,7 @@ def test_lines_are_counted_as_an_editor_does(tmp_path: Path) -> None:
     for row, problem in (("1200,hot,0,0,12", "line 46 has 'hot'"), ("1200,1", "line 46 has 2 cells, but line 3 has 5")):
         path.write_text("\n".join([*lines, row]) + "\n")
         assert problem in refusal(path, skip_lines=2)
-
-
-def test_names_before_which_another_line_stands_are_told(tmp_path: Path) -> None:
-    message = refusal(lay(tmp_path / "x.csv", before="made by X\n"))
+    message = refusal(lay(path, before="made by X\n"))  # a line stands before the names
     assert "line 2 has 5 cells, but line 1 has 1" in message
     assert "give skip_lines" in message
 
@@ -307,12 +284,9 @@ def test_a_german_table_is_asked_about_once(tmp_path: Path) -> None:
     assert "is the decimal '.'? Then give decimal: \".\"" in message
     message = refusal(lay(tmp_path / "x.csv", ";"))
     assert message.count("is the delimiter ';'? Then give delimiter: \";\"") == 1
-
-
-def test_a_word_among_numbers_with_decimal_commas_is_the_one_that_is_named(tmp_path: Path) -> None:
     path = lay(tmp_path / "x.csv", ";", ",")
     path.write_text(path.read_text() + "1200;hot;0;0;12\n")
-    assert "line 42 has 'hot'" in refusal(path, delimiter=";", decimal=",")
+    assert "line 42 has 'hot'" in refusal(path, delimiter=";", decimal=",")  # the word, not the numbers
 
 
 def test_an_empty_file_and_two_columns_of_one_name_are_refused(tmp_path: Path) -> None:

@@ -149,7 +149,7 @@ def test_a_command_rate_that_cannot_carry_it_is_refused(name: str, highest: str)
 # ---------------------------------------------------------------------- what each is for
 
 
-def test_a_chirp_covers_its_band_and_little_above() -> None:
+def test_a_chirp_covers_its_band_and_little_above_and_reaches_its_amplitude() -> None:
     for band in ((0.1, 10.0), (0.5, 4.0)):
         target = go1("chirp", band=band).target
         edges = np.geomspace(*band, 8)
@@ -158,9 +158,6 @@ def test_a_chirp_covers_its_band_and_little_above() -> None:
         assert np.all(inside > 1000 * above)
     speed = np.abs(np.diff(go1("chirp", speed=5.0).target, axis=0)).max() * RATE
     assert 4 < speed < 5.2  # the fade and the falling amplitude add a little to the sine's own
-
-
-def test_a_chirp_reaches_its_amplitude() -> None:
     swing = np.ptp(go1("chirp", amplitude=(0.1, 0.2, 0.3)).target[:5000], axis=0)
     np.testing.assert_allclose(swing, np.tile([0.2, 0.4, 0.6], 4), rtol=0.05)
 
@@ -209,12 +206,7 @@ def test_steps_are_many_some_large_and_off_the_policys_grid() -> None:
         assert len(np.unique(np.diff(edges))) > 10
         assert np.mean((edges + 1) % 10 != 0) > 0.5  # 50 Hz is every tenth command
     assert 20 * np.abs(change[:, 1::3]).max() > robot.EFFORT_LIMIT[1]  # the limit is reached at a gain of 20 N m/rad
-
-
-def test_large_steps_are_taken_by_two_joints_while_the_others_rest() -> None:
-    target = go1("steps").target
-    change = np.abs(np.diff(target, axis=0))
-    collected = set()
+    change, collected = np.abs(change), set()  # two joints take a large step while the others rest
     for row in np.flatnonzero((change > 0.65).any(axis=1)):
         movers = np.flatnonzero(change[row] > 0)
         assert len(movers) == 2
@@ -234,11 +226,7 @@ def test_a_gait_steps_at_its_rate_with_diagonal_legs_together() -> None:
     assert correlation[0, 3] > 0.8
     assert correlation[1, 2] > 0.8
     assert max(correlation[0, 1], correlation[0, 2], correlation[3, 1]) < -0.8
-
-
-def test_a_gait_lifts_the_foot_while_it_swings_forward() -> None:
-    target = go1("gait").target[1000:]
-    thigh, calf = target[:, 1], target[:, 2]
+    thigh, calf = target[1000:, 1], target[1000:, 2]  # the foot is lifted while it swings forward
     backward = np.gradient(thigh) > 0
     x = -0.213 * (np.sin(thigh) + np.sin(thigh + calf))
     height = -0.213 * (np.cos(thigh) + np.cos(thigh + calf))
@@ -280,9 +268,6 @@ def test_a_squat_keeps_the_feet_below_and_beside_one_another() -> None:
     assert 0.74 < share.min() < 0.85
     below = share[:, 0] < 0.9
     assert len(stretches(below)) >= 4
-
-
-def test_a_squat_stops_where_a_joint_does() -> None:
     limits = GO1[1].copy()
     limits[5, 0] = -1.7  # one calf bends less
     target = MEMBERS["squat"].target(clock(), GO1[0], limits, np.random.default_rng(0)).target

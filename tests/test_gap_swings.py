@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from go1exp.gap.comparison import Comparison, NotComparable, compare
-from go1exp.gap.data.cutting import Place
 from go1exp.gap.data.standing import LOADED, Log
 from go1exp.gap.data.swings import SwingWindows, TrunkMotion, foot_forces, places, swings
 from go1exp.gap.replay.replayer import Replayer
@@ -106,11 +105,6 @@ def test_legs_that_swing_together_share_a_window(
     assert [place.joints for place in made] == expected
     for place in made:
         assert place.first < place.last < place.end
-
-
-def test_all_joints_of_a_place_are_compared_unless_it_says_which() -> None:
-    assert Place(0.0, 1.0).compared(3).all()
-    assert Place(0.0, 1.0, joints=(1,)).compared(3).tolist() == [False, True, False]
 
 
 def test_legs_in_the_air_follow_the_free_robot_and_not_without_the_motion_of_its_trunk() -> None:
