@@ -34,16 +34,8 @@ RATE = 500.0
 SECONDS = 6
 ROWS = 3000
 ENCODER = 3.0e-5  # rad
-META = made_meta(
-    base="floating",
-    base_quat=None,
-    kp=(20.0,) * 12,
-    kd=(0.5,) * 12,
-    tau_limit=tuple(per_joint(EFFORT_LIMIT)),
-    episode="synthetic",
-)
-
-
+DRIVE: dict[str, Any] = {"kp": (20.0,) * 12, "kd": (0.5,) * 12, "tau_limit": tuple(per_joint(EFFORT_LIMIT))}
+META = made_meta(base="floating", base_quat=None, episode="synthetic", **DRIVE)
 STOPS = JOINT_POS_LIMITS
 TORQUES = joint_channels("tau_est", JOINTS)
 

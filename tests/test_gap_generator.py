@@ -459,17 +459,11 @@ def test_the_answer_is_the_robot_and_not_only_what_was_added() -> None:
 
 # ---------------------------------------------------------------------- the library's effects mean the same
 
-
 QUIET = [f"sensors.{name}={{noise: 0.0, step: 0.0}}" for name in ("q", "qd", "tau_est", "gyro", "acc", "attitude")]
 SIGNED = ("base_tilt", "encoder_offset", "link_com", "cogging", "parallel_stiffness")
 SHAPED = (
-    "asymmetric_friction",
-    "torque_speed_limit",
-    "command_delay",
-    "load_friction",
-    "armature",
-    "stribeck",
-    "point_load",
+    *("asymmetric_friction", "torque_speed_limit", "command_delay", "load_friction"),
+    *("armature", "stribeck", "point_load"),
 )
 
 
@@ -519,17 +513,10 @@ def test_both_sides_move_alike_under_the_same_effects() -> None:
 
 # ---------------------------------------------------------------------- a small fixed slice, solved and scored
 
-
 SEED = 20261121
-
-SLICE = (
-    ("null", 1),
-    ("single", 2 * len(cases.SUSPENDED) + cases.SUSPENDED.index("lag")),
-    ("outside", 0),
-    ("damaged", 2),
-)
+LAG = 2 * len(cases.SUSPENDED) + cases.SUSPENDED.index("lag")
+SLICE = (("null", 1), ("single", LAG), ("outside", 0), ("damaged", 2))
 """Kind and index: a background within tolerances, lag at 5 tolerances, one beyond the library, lost samples."""
-
 
 FAST = ("damaged",)
 ABOUT = ("benchmarks/gap/", "benchmarks/gap_solve.py", "go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/physics/")

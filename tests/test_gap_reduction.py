@@ -197,19 +197,17 @@ def at(cost: np.ndarray, gain: np.ndarray | None = None) -> set[str]:
     return {JOINTS[j] for j in inside}
 
 
-def test_one_loaded_link_is_one_joint_though_all_were_free() -> None:
-    cost = np.full(12, 4.0)
-    cost[5] = 900.0
-    assert at(cost) == {JOINTS[5]}
-
-
-def test_an_effect_that_is_everywhere_is_named_everywhere() -> None:
-    assert at(np.full(12, 300.0)) == set(JOINTS)
-
-
-def test_a_part_of_the_robot_is_found_as_one() -> None:
-    cost = np.tile([3.0, 3.0, 250.0], 4)
-    assert at(cost) == {j for j in JOINTS if j.endswith("calf")}
+@pytest.mark.parametrize(
+    ("cost", "joints"),
+    [
+        (np.where(np.arange(12) == 5, 900.0, 4.0), {JOINTS[5]}),
+        (np.full(12, 300.0), {*JOINTS}),
+        (np.tile([3.0, 3.0, 250.0], 4), {j for j in JOINTS if j.endswith("calf")}),
+    ],
+    ids=["one loaded link though all were free", "everywhere", "a part of the robot as one"],
+)
+def test_a_term_is_at_the_joints_that_pay(cost: np.ndarray, joints: set[str]) -> None:
+    assert at(cost) == joints
 
 
 def test_a_joint_that_held_out_windows_do_not_miss_is_left_out() -> None:
@@ -232,18 +230,14 @@ def test_fewer_joints_that_lose_little_are_to_be_fitted_the_fewest_first() -> No
     assert reduction.fewer(linear, "link_mass", frozenset()) == []  # the others are within their tolerance
 
 
-def test_a_value_on_its_tolerance_is_not_beyond_it() -> None:
+def test_a_value_on_its_tolerance_is_not_beyond_it_and_is_not_asked() -> None:
     """A value that is clipped to 1 + 0.05 is 0.05 and 4e-17 away from 1."""
     p = DECLARED.param(("link_mass", "scale"))
     on, beyond = (np.full(12, p.null + far * p.tolerance) for far in (1.0, 1.001))
     assert abs(on[0] - p.null) > p.tolerance
     assert not candidates.beyond("link_mass", {("link_mass", "scale"): on}, JOINTS, DECLARED).any()
     assert candidates.beyond("link_mass", {("link_mass", "scale"): beyond}, JOINTS, DECLARED).all()
-
-
-def test_joints_that_are_within_their_tolerance_are_not_asked() -> None:
-    scale = np.ones(12)
-    scale[3] = 2.0
+    scale = np.where(np.arange(12) == 3, 2.0, 1.0)
     linear: Any = Quadratic({("link_mass", "scale"): scale}, np.full(12, 500.0), np.zeros(12))
     assert reduction.chosen(linear, "link_mass", frozenset(), np.random.default_rng(0)) == {3}
 
@@ -258,19 +252,25 @@ def test_pieces_are_joints_parts_legs_sides_and_all() -> None:
 # ---------------------------------------------------------------------- names
 
 
+def choice(
+    gain: np.ndarray, numbers: Any, second: tuple[bool, bool] = (False, False)
+) -> tuple[int, list[bool], list[bool]]:
+    """Return the chosen of two candidates of which nothing remains, which are its equals, and which stand aside."""
+    counts, all_out, none = np.array(numbers, dtype=float), np.ones(2, dtype=bool), np.zeros(2, dtype=bool)
+    chosen, alias, aside = _choice(gain, all_out, none, counts, np.array(second), np.random.default_rng(0))
+    return int(chosen), alias.tolist(), aside.tolist()
+
+
 def test_a_tilt_is_simpler_than_the_twelve_offsets_that_imitate_it() -> None:
     offsets = {("encoder_offset", "offset"): np.full(12, 0.02)}
     tilt = {("base_tilt", "roll"): np.array([0.03]), ("base_tilt", "pitch"): np.array([-0.02])}
     values = [("encoder_offset", offsets), ("base_tilt", tilt)]
-    numbers = np.array([(candidates.count(name, theta, MACHINE), len(theta)) for name, theta in values], dtype=float)
+    numbers = [(candidates.count(name, theta, MACHINE), len(theta)) for name, theta in values]
     gain = np.random.default_rng(0).normal(2.0, 0.1, (2, 60))
     gain[1] = gain[0] - 0.01  # half a per cent less: the same
-    all_out, none = np.ones(2, dtype=bool), np.zeros(2, dtype=bool)
-    chosen, alias, aside = _choice(gain, all_out, none, numbers, none, np.random.default_rng(0))
-    assert chosen == 1
-    np.testing.assert_array_equal((alias, aside), ([False, True], [True, False]))
+    assert choice(gain, numbers) == (1, [False, True], [True, False])
     gain[1] = 0.8 * gain[0]  # but it must explain as much
-    assert _choice(gain, all_out, none, numbers, none, np.random.default_rng(0))[0] == 0
+    assert choice(gain, numbers)[0] == 0
 
 
 @pytest.mark.parametrize(
@@ -286,11 +286,7 @@ def test_of_equals_that_mean_the_same_the_one_at_fewer_joints_comes_first(
 ) -> None:
     gain = np.array(gains)[:, None] + np.random.default_rng(0).normal(0.0, 0.2, (2, 60))
     gain += np.array(gains)[:, None] - gain.mean(axis=1, keepdims=True)
-    all_out, none = np.ones(2, dtype=bool), np.zeros(2, dtype=bool)
-    counts = np.array([(count, 1.0) for count in numbers])
-    first, alias, aside = _choice(gain, all_out, none, counts, none, np.random.default_rng(0))
-    assert first == chosen
-    np.testing.assert_array_equal((alias, aside), ([True, True], [False, False]))
+    assert choice(gain, [(count, 1.0) for count in numbers]) == (chosen, [True, True], [False, False])
 
 
 @pytest.mark.parametrize(
@@ -305,12 +301,8 @@ def test_of_equals_that_mean_the_same_the_one_at_fewer_joints_comes_first(
 def test_where_the_gap_is_small_what_is_easily_taken_for_another_is_named_with_it(
     gains: tuple[float, float], numbers: tuple[tuple[float, float], ...], chosen: int, alias: tuple[bool, bool]
 ) -> None:
-    noise = np.random.default_rng(0).normal(0.0, 0.01, 60)
-    gain = np.array(gains)[:, None] + noise
-    all_out, none, second = np.ones(2, dtype=bool), np.zeros(2, dtype=bool), np.array([False, True])
-    found = _choice(gain, all_out, none, np.array(numbers), second, np.random.default_rng(0))
-    assert found[0] == chosen
-    np.testing.assert_array_equal(found[1], alias)
+    gain = np.array(gains)[:, None] + np.random.default_rng(0).normal(0.0, 0.01, 60)
+    assert choice(gain, numbers, (False, True))[:2] == (chosen, list(alias))
 
 
 def test_what_one_that_strains_is_easily_taken_for_is_tried_in_the_way_that_relieves_most() -> None:

@@ -139,22 +139,16 @@ def test_a_robot_on_its_feet_keeps_its_tolerances() -> None:
 @pytest.mark.parametrize(
     ("override", "line"),
     [
-        (
-            "model.tolerances.colomb.bound=0.2",
-            "model.tolerances.colomb: unknown effect 'colomb'; did you mean 'coulomb'",
-        ),
-        (
-            "model.tolerances.coulomb.bund=0.2",
-            "model.tolerances.coulomb.bund: unknown parameter 'bund'; did you mean 'bound'",
-        ),
-        ("model.tolerances.stribeck.speed=0.2", "model.tolerances.stribeck.speed: is a shape, which has no tolerance"),
-        ("model.tolerances.coulomb.bound=-1", "model.tolerances.coulomb.bound = -1: input should be greater than 0"),
-        ("model.tolerances.coulomb=0.2", "model.tolerances.coulomb = 0.2: input should be an object"),
+        ("colomb.bound=0.2", "colomb: unknown effect 'colomb'; did you mean 'coulomb'"),
+        ("coulomb.bund=0.2", "coulomb.bund: unknown parameter 'bund'; did you mean 'bound'"),
+        ("stribeck.speed=0.2", "stribeck.speed: is a shape, which has no tolerance"),
+        ("coulomb.bound=-1", "coulomb.bound = -1: input should be greater than 0"),
+        ("coulomb=0.2", "coulomb = 0.2: input should be an object"),
     ],
 )
 def test_a_wrong_tolerance_is_refused_in_one_line(override: str, line: str) -> None:
-    with pytest.raises(ConfigError, match=re.escape(line)):
-        App("gap", APP.task).run(["logs=x", override])
+    with pytest.raises(ConfigError, match=re.escape(f"model.tolerances.{line}")):
+        App("gap", APP.task).run(["logs=x", f"model.tolerances.{override}"])
 
 
 # ---------------------------------------------------------------------- what is written down

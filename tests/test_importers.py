@@ -19,14 +19,8 @@ from go1exp.logs.recording import Recording, RecordingError
 from go1exp.robot import JOINT_POS_LIMITS, JOINTS, NOMINAL_STANCE
 from tests.made import real
 
-COUNTS = {
-    "go2_in_air": 1,
-    "ak80_double_pendulum": 18,
-    "servo_pendulum_xl330": 12,
-    "so101_arm": 40,
-    "scaler_walk_mocap": 8,
-    "go1_walk_snippet": 1,
-}
+COUNTS = {"go2_in_air": 1, "ak80_double_pendulum": 18, "servo_pendulum_xl330": 12, "so101_arm": 40}
+COUNTS |= {"scaler_walk_mocap": 8, "go1_walk_snippet": 1}
 
 
 def imported(name: str, **options: Any) -> list[Recording]:
@@ -292,10 +286,7 @@ WHOLE = ",".join([*HEADER, "kp", "kd"])
         ("kp,kd\n20,a\n", "not a table of numbers"),
         ("kp,kd\n20,0.5,1\n", "one name for each of its 3 columns"),
         ("kp,kd\n20,0.5\n", "no column 'jpos0'"),
-        (
-            ",".join([*HEADER, "kp", "kd"]) + "\n" + ("0," * 36 + "20,0.5\n") * 3 + "0," * 36 + "25,0.5\n",
-            "kp: must be one",
-        ),
+        (f"{WHOLE}\n" + ("0," * 36 + "20,0.5\n") * 3 + "0," * 36 + "25,0.5\n", "kp: must be one"),
         (",".join([*HEADER, "kp"]) + "\n" + ("0," * 36 + "20\n") * 3, "no column 'kd'"),
         (f"{WHOLE}\n" + ("0," * 36 + "-1,0.5\n") * 3, "metadata.kp.0 = -1.0"),
         (f"{WHOLE}\n" + ("nan," * 36 + "20,0.5\n") * 3, "q_FR_hip: must be finite"),
