@@ -193,10 +193,7 @@ def test_whatever_is_wrong_is_told_by_its_name(tmp_path: Path, changes: dict[str
         ("1200,,0,0,12", "column 'angle [deg]': 1 cell is empty or NaN, the first in line 42"),
         ("1200,inf,0,0,12", "column 'angle [deg]': inf in line 42; every value must be finite"),
         ("1200,1,0", "line 42 has 3 cells, but line 1 has 5; every line must have as many as the first"),
-        (
-            "1195,1,0,0,12",
-            "column 'stamp' (for t): must increase strictly, but line 42 has 1195 after 1195 (1 such row); leave",
-        ),
+        ("1195,1,0,0,12", "(for t): must increase strictly, but line 42 has 1195 after 1195 (1 such row); leave"),
     ],
 )
 def test_a_bad_row_is_told_by_column_and_line(tmp_path: Path, row: str, said: str) -> None:
@@ -239,6 +236,9 @@ def test_another_encoding_is_told_and_can_be_given(tmp_path: Path, encoding: str
         assert f"importer.csv.encoding = {name!r}: unknown encoding; utf-8" in refusal(path, encoding=name)
 
 
+ROUNDED, COUNTER = np.round(4.0 * K, -1), 1000 * np.arange(100) % 2**16
+
+
 def clocked(path: Path, stamps: np.ndarray) -> Path:
     path.write_text("stamp,q\n" + "".join(f"{t:g},{k}\n" for k, t in enumerate(stamps)))
     return path
@@ -247,18 +247,12 @@ def clocked(path: Path, stamps: np.ndarray) -> Path:
 @pytest.mark.parametrize(
     ("stamps", "problem"),
     [
-        (
-            np.round(4.0 * K, -1),
-            "line 3 has 0 after 0 (23 such rows); its times are rounded: take t out of columns ",
-        ),
-        (np.round(4.0 * K, -1), "give rate_hz (about 2"),
+        (ROUNDED, "line 3 has 0 after 0 (23 such rows); its times are rounded: take t out of columns "),
+        (ROUNDED, "give rate_hz (about 2"),
         (4 * K[::-1], "line 3 has 152 after 156 (39 such rows); it runs backward: put the rows in the other order"),
         (np.where(K == 20, 100, 10 * K), "line 22 has 100 after 190 (1 such row); sort the rows by time, or leave"),
         (np.where(K == 20, 190, 10 * K), "line 22 has 190 after 190 (1 such row); leave such rows out"),
-        (
-            1000 * np.arange(100) % 2**16,
-            "line 68 has 464 after 65000 (1 such row); it is a counter of 16 bits that overflows: add 65536",
-        ),
+        (COUNTER, "line 68 has 464 after 65000 (1 such row); it is a counter of 16 bits that overflows: add 65536"),
         (K[:1], "has 1 row of numbers; at least 2 are needed"),
     ],
 )
