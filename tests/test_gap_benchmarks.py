@@ -50,6 +50,11 @@ def value(found: score.Score, figure: str) -> float | None:
     return found.figures[figure][0]
 
 
+def counted(found: score.Score, **figures: float | None) -> None:
+    """The score has these figures."""
+    assert {name: value(found, name) for name in figures} == pytest.approx(figures)
+
+
 def test_wilson_is_the_textbook_formula() -> None:
     good, n, z = 9, 12, 1.959964
     middle = (good / n + z**2 / (2 * n)) / (1 + z**2 / n)
@@ -81,19 +86,10 @@ def test_single_effects() -> None:
         "small": result("no gap"),
     }
     found = score.evaluate(answers, results)
-    assert value(found, "first") == pytest.approx(3 / 5)  # right, alias, and ranked first though not named
-    assert value(found, "first_exact") == pytest.approx(2 / 5)
-    assert value(found, "in_set") == pytest.approx(2 / 5)
-    assert value(found, "set_size") == pytest.approx(5 / 3)
-    assert value(found, "singles_wrong") == pytest.approx(1 / 5)
-    assert value(found, "small_not_wrong") == 1.0
-    assert value(found, "wrong_explained_library") == pytest.approx(1 / 5)
-    assert value(found, "param_error") == pytest.approx(0.1)  # 0.02 / 0.2 and 0.03 / 0.3
-    assert value(found, "coverage") == pytest.approx(1 / 2)
-    assert value(found, "closed_median") == pytest.approx(0.9)
-    assert value(found, "seconds_per_case") == value(found, "seconds_single") == 1.0
-    assert value(found, "seconds_pair") is None
-    assert value(found, "missing") == 1.0
+    counted(found, first=3 / 5, first_exact=2 / 5, in_set=2 / 5, set_size=5 / 3)  # ranked first, though not named
+    counted(found, singles_wrong=1 / 5, small_not_wrong=1.0, wrong_explained_library=1 / 5, missing=1.0)
+    counted(found, param_error=0.1, coverage=1 / 2, closed_median=0.9)  # errors of 0.02 / 0.2 and 0.03 / 0.3
+    counted(found, seconds_per_case=1.0, seconds_single=1.0, seconds_pair=None)
     assert found.confusion["viscous", "kd_scale"] == 1
     assert found.confusion["armature", "-"] == 1
     assert any(line.startswith("wrong: single, lag x5 on 2 joints -> explained") for line in found.failures["first"])
@@ -106,7 +102,7 @@ def test_visible_effects_are_counted_apart() -> None:
         "hidden": answer("single", effect("base_tilt", 2.0, [], roll=0.02), signal=0.4),
     }
     found = score.evaluate(answers, {"seen": result("explained", named("coulomb")), "hidden": result("no gap")})
-    assert (value(found, "first"), value(found, "first_visible")) == (0.5, 1.0)
+    counted(found, first=0.5, first_visible=1.0)
 
 
 def test_effects_that_the_tolerances_make_up_for_are_counted_apart() -> None:
@@ -125,12 +121,8 @@ def test_effects_that_the_tolerances_make_up_for_are_counted_apart() -> None:
 
 
 def test_null_cases() -> None:
-    answers = {
-        "good": answer("null"),
-        "named": answer("null"),
-        "compensating": answer("null"),
-        "background": answer("null", beyond="encoder_offset"),
-    }
+    answers = dict.fromkeys(("good", "named", "compensating"), answer("null"))
+    answers["background"] = answer("null", beyond="encoder_offset")
     results = {
         "good": result("no gap"),
         "named": result("partly explained", named("lag")),
@@ -138,16 +130,13 @@ def test_null_cases() -> None:
         "background": result("explained", named("base_tilt")),  # in the family of what is really there
     }
     found = score.evaluate(answers, results)
-    assert (value(found, "false_names"), value(found, "nulls")) == (2.0, 4.0)
-    assert found.figures["false_name_rate"][0] == 0.5
+    counted(found, false_names=2.0, nulls=4.0, false_name_rate=0.5)
     near = {"right": answer("near_null", beyond="viscous"), "wrong": answer("near_null", beyond="viscous")}
     found = score.evaluate(
         answers | near,
         results | {"right": result("explained", named("kd_scale")), "wrong": result("explained", named("coulomb"))},
     )
-    assert (value(found, "false_names"), value(found, "nulls")) == (2.0, 6.0)
-    assert value(found, "false_names_beyond") == pytest.approx(1 / 3)
-    assert value(found, "nulls_no_gap") == pytest.approx(1 / 3)
+    counted(found, false_names=2.0, nulls=6.0, false_names_beyond=1 / 3, nulls_no_gap=1 / 3)
 
 
 def test_joints_are_right_if_they_are_all_and_no_others() -> None:
@@ -172,8 +161,7 @@ def test_effects_beyond_the_library() -> None:
         "explained": result("explained", named("coulomb")),
     }
     found = score.evaluate(answers, results)
-    assert value(found, "outside_handled") == pytest.approx(2 / 5)
-    assert value(found, "wrong_explained") == pytest.approx(1 / 5)
+    counted(found, outside_handled=2 / 5, wrong_explained=1 / 5)
 
 
 def test_pairs() -> None:
@@ -186,17 +174,16 @@ def test_pairs() -> None:
         "worse": result("explained", named("coulomb"), named("payload")),
     }
     found = score.evaluate(answers, results)
-    assert value(found, "pairs_both") == pytest.approx(1 / 3)
-    assert value(found, "pair_precision") == pytest.approx(4 / 5)
+    counted(found, pairs_both=1 / 3, pair_precision=4 / 5)
 
 
 def test_friction_of_two_directions_is_its_mean_and_a_constant() -> None:
     answers = {"a": answer("single", effect("asymmetric_friction", forward=[0.2, 0.2], backward=[0.0, 0.0]))}
     both = result("explained", named("coulomb"), named("encoder_offset"))
     found = score.evaluate(answers, {"a": both})
-    assert (value(found, "first"), value(found, "in_set"), value(found, "first_exact")) == (1.0, 1.0, 0.0)
+    counted(found, first=1.0, in_set=1.0, first_exact=0.0)
     found = score.evaluate(answers, {"a": result("explained", named("coulomb"))})
-    assert (value(found, "first"), value(found, "in_set")) == (1.0, 0.0)
+    counted(found, first=1.0, in_set=0.0)
 
 
 def test_silent_and_damaged_logs() -> None:
@@ -216,9 +203,7 @@ def test_silent_and_damaged_logs() -> None:
         "null": result("bad log"),
     }
     found = score.evaluate(answers, results)
-    assert value(found, "not_excited_unnamed") == value(found, "not_excited_said") == 0.5
-    assert value(found, "damaged_caught") == 0.5
-    assert value(found, "bad_log_only_if_bad") == pytest.approx(2 / 3)
+    counted(found, not_excited_unnamed=0.5, not_excited_said=0.5, damaged_caught=0.5, bad_log_only_if_bad=2 / 3)
 
 
 def test_numbers_and_lists_are_parameters_too() -> None:
@@ -232,7 +217,7 @@ def test_numbers_and_lists_are_parameters_too() -> None:
     }
     found = score.evaluate(answers, results)
     assert found.figures["param_error"] == pytest.approx((0.1, 0.05, 0.25, 3), abs=0.06)  # 5 %, 10 %, 25 %
-    assert value(found, "coverage") == pytest.approx(2 / 3)
+    counted(found, coverage=2 / 3)
 
 
 def test_nonsense_is_refused() -> None:
