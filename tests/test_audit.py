@@ -105,7 +105,8 @@ def rows(recording: Recording, kept: Any) -> Recording:
     return replace(recording, channels={k: v[kept] for k, v in recording.channels.items()})
 
 
-ARM = {"robot": "arm", "base": "fixed", "base_quat": (1.0, 0.0, 0.0, 0.0), "kp": None, "kd": None, "tau_limit": None}
+ARM: dict[str, Any] = {"robot": "arm", "base": "fixed", "base_quat": (1.0, 0.0, 0.0, 0.0)}
+ARM |= dict.fromkeys(("kp", "kd", "tau_limit"))
 
 
 def realistic(recording: Recording, seed: int = 0) -> Recording:

@@ -254,11 +254,11 @@ def test_pieces_are_joints_parts_legs_sides_and_all() -> None:
 
 def choice(
     gain: np.ndarray, numbers: Any, second: tuple[bool, bool] = (False, False)
-) -> tuple[int, list[bool], list[bool]]:
+) -> tuple[int | None, list[bool], list[bool]]:
     """Return the chosen of two candidates of which nothing remains, which are its equals, and which stand aside."""
     counts, all_out, none = np.array(numbers, dtype=float), np.ones(2, dtype=bool), np.zeros(2, dtype=bool)
     chosen, alias, aside = _choice(gain, all_out, none, counts, np.array(second), np.random.default_rng(0))
-    return int(chosen), alias.tolist(), aside.tolist()
+    return chosen, alias.tolist(), aside.tolist()
 
 
 def test_a_tilt_is_simpler_than_the_twelve_offsets_that_imitate_it() -> None:
