@@ -515,16 +515,6 @@ def test_effects_on_gains_need_a_drive_that_has_them(
             make_task(effect, *drive)
 
 
-def test_a_net_drives_the_robot(start_core: Callable[..., Go1Core], make_net: Callable[..., Path]) -> None:
-    core = start_core("actuator=net", f"actuator.file={make_net()}")
-    seen = []
-    for _ in range(3):
-        core.step(torch.zeros(4, 12))
-        seen.append(core.plant.torque.clone())
-    assert all(torch.isfinite(tau).all() for tau in seen)
-    assert not torch.equal(seen[0], seen[1])
-
-
 def test_a_run_folder_has_a_copy_of_its_net_even_of_one_that_a_delay_wraps(make_net: Any, tmp_path: Path) -> None:
     from go1exp.train import run_folder
 

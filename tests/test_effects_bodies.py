@@ -540,15 +540,6 @@ def test_gears_make_no_energy(kinds: tuple[str, ...]) -> None:
     assert relative[-1].median() < 0.98
 
 
-def test_rotors_continue_from_their_saved_state() -> None:
-    effects = {"flexibility": {"compliance": 0.01}, "backlash": {"gap": 0.01}}
-    first, second = rig(effects), rig(effects)
-    settle(first, robot.NOMINAL_STANCE + 0.2, 0.05)
-    second.load_state_dict(first.state_dict())
-    second.backend.load_state_dict(first.backend.state_dict())
-    assert torch.equal(settle(first, seconds=0.05), settle(second, seconds=0.05))
-
-
 def test_a_gear_may_carry_more_than_the_drive_can_make() -> None:
     """A rotor at speed that is stopped by its gear: the drive's limit is not the gear's."""
     plant = rig({"flexibility": {"compliance": 1e-3}}, kp=0.0, kd=0.0)

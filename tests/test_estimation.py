@@ -17,6 +17,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
 from benchmarks.replay import estimate
@@ -42,6 +43,7 @@ from go1exp.logs.record.plan import Episode, make_motion
 from go1exp.logs.record.sensors import Channel, SensorConfig
 from go1exp.logs.record.simulate import Rig, play
 from go1exp.logs.recording import VECTORS
+from go1exp.mdp.kinematics import foot_positions
 from go1exp.sim.task import parse_task
 from tests.kalman import NumpyFilter, foot
 
@@ -167,18 +169,11 @@ def standing(t: float, **changes: np.ndarray) -> np.ndarray:
 # ---------------------------------------------------------------------- kinematics
 
 
-@pytest.mark.parametrize(
-    ("angles", "feet"),
-    [
-        ((0.0, 0.0, -0.9), {"FR": (0.354949, -0.12675, -0.345403), "RL": (-0.021251, 0.12675, -0.345403)}),
-        ((0.3, 0.5, -1.2), {"FR": (0.223201, -0.019793, -0.357853), "FL": (0.223201, 0.226561, -0.310570)}),
-        ((-0.4, 1.1, -2.2), {"FR": (0.1881, -0.195683, -0.146825), "FL": (0.1881, 0.045187, -0.209132)}),
-    ],
-)
-def test_the_go1s_feet_are_where_the_vendors_model_has_them(angles: tuple[float, ...], feet: dict) -> None:
-    for name, place in feet.items():
-        leg = go1().legs[robot.LEGS.index(name)]
-        np.testing.assert_allclose(foot(leg, np.array(angles))[0], place, atol=1e-5)
+def test_the_go1s_feet_are_where_its_model_has_them() -> None:
+    """In closed form, which is the model's and the vendor's: test_feet.py, test_robot_model.py."""
+    q = np.random.default_rng(0).uniform(*robot.JOINT_POS_LIMITS.T, (20, 12))
+    feet = np.array([[foot(leg, one[3 * k : 3 * k + 3])[0] for k, leg in enumerate(go1().legs)] for one in q])
+    np.testing.assert_allclose(feet, foot_positions(torch.as_tensor(q)), atol=1e-5)
 
 
 @pytest.mark.parametrize("config", [go1(), scaler()], ids=["chain", "polynomial"])

@@ -28,7 +28,7 @@ from go1exp.deploy.runtime import go1_wire as wire
 from go1exp.deploy.runtime.bundle import load
 from go1exp.deploy.runtime.commands import CommandConfig
 from go1exp.deploy.runtime.estimate import BOTH, TORQUE, KalmanEstimator, settings
-from go1exp.deploy.runtime.go1_check import Bounds, Observed, evaluated, listen
+from go1exp.deploy.runtime.go1_check import Bounds, Observed, evaluated
 from go1exp.deploy.runtime.job import Job, run_check, run_job
 from go1exp.deploy.runtime.launch import RobotError
 from go1exp.deploy.runtime.udp import Go1Link
@@ -508,13 +508,3 @@ def test_forces_that_balance_the_torques_are_those_under_the_feet(bundle: str) -
     forces = forces_by_torque(state.joint_pos, state.joint_torque, np.array([0.0, 0.0, 1.0]), kinematics(go1()))
     # The legs' own weight is not in the torques of a foot: 7.5 kg of the robot's 12.7 are legs.
     np.testing.assert_allclose(forces, state.foot_force, rtol=0.25)
-
-
-def test_listening_lasts_as_long_as_asked() -> None:
-    with speakers(1) as (other,):
-        link = Go1Link(*other.getsockname())
-        clock = iter(np.arange(0.0, 10.0, 0.1))
-        heard = listen(link, 1.0, now=lambda: float(next(clock)), sleep=lambda s: None)
-        link.close()
-    assert heard.states == []
-    assert heard.seconds > 1.0

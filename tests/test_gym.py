@@ -191,12 +191,8 @@ def test_a_seed_decides_an_episode_and_all_that_follow() -> None:
         np.testing.assert_array_equal(a, b)
         np.testing.assert_array_equal(a, c)
     assert not np.array_equal(first[0], other[0])
-
-
-def test_without_a_seed_the_next_episode_is_another_one() -> None:
-    env = Go1Env(LIVELY)
-    first, second = env.reset(seed=5)[0], env.reset()[0]
-    assert not np.array_equal(first, second)
+    env.reset(seed=5)
+    assert not np.array_equal(env.reset()[0], first[0])  # without a seed the next episode is another one
 
 
 def test_arrays_of_the_single_environment_are_the_callers_own() -> None:
@@ -239,14 +235,6 @@ def test_a_single_environment_ends_with_its_last_observation() -> None:
     np.testing.assert_array_equal(observation[36:], action)  # not that of a new episode, which would be zero
     assert observation[12:36].any()
     assert not env.reset()[0][36:].any()
-
-
-def test_a_fault_stops_the_single_environment_until_it_is_reset(elsewhere: None) -> None:
-    env = Go1Env(QUIET)
-    env.reset(seed=0)
-    with pytest.raises(NumericalFault, match="action is not finite"):
-        env.step(np.full(12, np.nan, np.float32))
-    assert np.isfinite(env.reset(seed=0)[0]).all()
 
 
 @pytest.mark.parametrize(
@@ -364,18 +352,6 @@ def test_arrays_of_the_batch_are_the_callers_own(make_core: Make) -> None:
     assert len(kept) > 92
     for a, b in zip(kept, copies, strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-def test_what_a_caller_does_to_an_observation_does_not_reach_the_robots(make_core: Make) -> None:
-    first, second = (quiet_batch(make_core(*LIVELY, num_envs=3)) for _ in range(2))
-    a, b = first.reset(), second.reset()
-    for action in actions(3, 25):
-        np.testing.assert_array_equal(a, b)
-        a[:] = np.nan
-        a, reward, done, _ = first.step(action)
-        b, expected, _, _ = second.step(action)
-        np.testing.assert_array_equal(reward, expected)
-        reward[:], done[:] = np.nan, True
 
 
 def test_seeding_the_batch_makes_it_reproducible(make_core: Make) -> None:

@@ -297,10 +297,6 @@ def of_kind(file: Path, kind: str) -> list[Any]:
     return [getattr(r, kind) for r in wandb_records(file) if r.WhichOneof("record_type") == kind]
 
 
-def wait_for_the_end(file: Path) -> None:
-    history(file)
-
-
 def test_an_offline_run_holds_name_group_tags_notes_config_videos_evaluations_and_artifacts(
     tmp_path: Path, no_account: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -359,7 +355,7 @@ def test_variables_of_the_environment_go_before_the_settings(
     (tmp_path / "elsewhere").mkdir()
     assert log_to_wandb(tmp_path, range(1, 2)) == "abcd1234"
     (file,) = (tmp_path / "elsewhere").rglob("*.wandb")
-    wait_for_the_end(file)
+    history(file)  # wait for the end
     about = of_kind(file, "run")[0]
     assert (about.run_id, about.project, about.run_group) == ("abcd1234", "theirs", "g")
     assert (about.display_name, about.notes, set(about.tags)) == ("n", "why", {"a", "b"})
@@ -374,7 +370,7 @@ def test_the_tables_of_a_report_are_logged(tmp_path: Path, no_account: None) -> 
     }
     metrics.log_tables(tables, tmp_path / "report.html", "go1exp-tests", "offline", tmp_path)
     (file,) = tmp_path.rglob("*.wandb")
-    wait_for_the_end(file)
+    history(file)  # wait for the end
     assert of_kind(file, "run")[0].job_type == "report"
     (table,) = tmp_path.rglob("grid_comparison*.table.json")
     content = json.loads(table.read_text())

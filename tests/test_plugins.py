@@ -337,31 +337,6 @@ def test_terms_that_remember_are_called_once_a_step_and_forget_where_an_episode_
             assert parts[name].calls.tolist() == observed.tolist()
 
 
-def test_terms_that_remember_continue_from_a_saved_state_bit_for_bit() -> None:
-    first, second = remembering(), remembering()
-    first.reset()
-    second.reset()
-    actions = torch.randn(9, 3, 12, generator=torch.Generator().manual_seed(0))
-    for k in range(3):
-        first.step(actions[k])
-    second.load_state_dict(first.state_dict())
-    for k in range(3, 9):
-        a, b = first.step(actions[k]), second.step(actions[k])
-        assert torch.equal(a.reward, b.reward)
-        assert torch.equal(a.final_observation, b.final_observation)
-
-
-def test_a_term_that_remembers_gives_a_robot_the_same_alone_and_in_a_batch() -> None:
-    batch, alone = remembering(4, noise=False), remembering(1, noise=False, first_env=2)
-    batch.reset()
-    alone.reset()
-    actions = torch.randn(9, 4, 12, generator=torch.Generator().manual_seed(0))
-    for k in range(9):
-        a, b = batch.step(actions[k]), alone.step(actions[k, 2:3])
-        assert torch.equal(a.reward[2:3], b.reward)
-        assert torch.equal(a.observation[2:3], b.observation)
-
-
 def test_an_observation_that_remembers_cannot_be_exported_and_that_is_said() -> None:
     core = remembering()
     with pytest.raises(ExportError, match=r"observation\.memory_of_speed: has a memory"):

@@ -115,12 +115,17 @@ def load_run(run: Path, which: Path | None = None) -> tuple[TrainConfig, Policy,
 def load_policy(run: Path, config: PPOConfig, which: Path | None = None) -> tuple[Policy, dict[str, Any]]:
     """Load the policy of a run as a function; arguments and errors as ``load_network``'s."""
     network, about = load_network(run, config, which)
+    return acting(network), about
+
+
+def acting(network: GaussianPolicy) -> Policy:
+    """Return a network as a function."""
 
     def policy(observation: Tensor) -> Tensor:
         with torch.no_grad():
             return network._predict(observation, deterministic=True)
 
-    return policy, about
+    return policy
 
 
 def load_network(run: Path, config: PPOConfig, which: Path | None = None) -> tuple[GaussianPolicy, dict[str, Any]]:

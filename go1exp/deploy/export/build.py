@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from go1exp import __version__, robot
@@ -32,7 +31,7 @@ from go1exp.sim.effects.rules import nested_actuators
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TaskConfig
 from go1exp.train import run_folder
-from go1exp.train.policy import load_network
+from go1exp.train.policy import acting, load_network
 
 
 def readings(core: Go1Core) -> dict[str, Tensor]:
@@ -151,12 +150,7 @@ def build(
     module = DeployedPolicy(network, config.task.observation, config.task.action)
     with one_thread():
         model = to_onnx(module)
-
-        def policy(observation: Tensor) -> Tensor:
-            with torch.no_grad():
-                return network._predict(observation, deterministic=True)
-
-        trace = record(config.task, policy, module.inputs, seconds, seed, on_step)
+        trace = record(config.task, acting(network), module.inputs, seconds, seed, on_step)
     if not trace:
         raise ExportError(f"{run}: every step of the trace ended an episode; there is nothing to replay")
     file = Path(about["file"])
