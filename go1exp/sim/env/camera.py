@@ -142,15 +142,11 @@ class Stage:
         self._window = self._cut((0.0, 0.0))
         self.model = self._build()
         self.data = mujoco.MjData(self.model)
-        self.model.vis.headlight.ambient[:] = 0.25
-        self.model.vis.map.fogstart, self.model.vis.map.fogend = (
-            2.5,
-            4.9,
-        )  # in extents of 2 m: hides the edge of the drawn ground
-        self.model.vis.rgba.fog[:] = self.model.vis.rgba.haze
-        self.model.vis.quality.shadowsize = (
-            2048  # half of the default: 12 ms a picture less in software, and looks the same
-        )
+        vis = self.model.vis
+        vis.headlight.ambient[:] = 0.25
+        vis.map.fogstart, vis.map.fogend = 2.5, 4.9  # in extents of 2 m: hides the edge of the drawn ground
+        vis.rgba.fog[:] = vis.rgba.haze
+        vis.quality.shadowsize = 2048  # half of the default: 12 ms a picture less in software, and looks the same
 
     def place(self, env: int) -> bool:
         """Take over the state of an environment; return whether the ground was exchanged with it."""
