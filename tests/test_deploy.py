@@ -912,12 +912,12 @@ def test_what_is_wrong_is_said_in_a_line(bundle: str, tmp_path: Path, capfd: pyt
 
 @pytest.mark.slow("go1exp/deploy/", "go1exp/deploy/sim_robot/", "go1exp/cli/", "go1exp/deploy/export/")
 def test_the_bench_measures_the_runtime(monkeypatch: pytest.MonkeyPatch) -> None:
-    from go1exp.evaluate.bench import deploy
+    from go1exp.evaluate.bench import deploy, env
 
     monkeypatch.setattr(deploy, "RATE", 100.0)
     monkeypatch.setenv("PYTHONPATH", str(data_root()))
     rounds: list[tuple[int, int]] = []
-    figures = deploy.run(compose("train", SMALL), 1, 1, 0.5, lambda *done: rounds.append(done))
+    figures = deploy.run(compose("train", SMALL), env.Measured(1, 1, 0.5, lambda *done: rounds.append(done)))
     assert rounds == [(1, 1)]
     assert 0 < figures["command_p50_ms"] <= figures["command_p99_ms"]
     assert figures["policy_us"] > 1

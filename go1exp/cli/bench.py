@@ -16,6 +16,7 @@ from go1exp.config.schema import settings as schema
 from go1exp.config.schema.registry import ConfigError, Count, Positive
 
 if TYPE_CHECKING:
+    from go1exp.evaluate.bench.env import Measured
     from go1exp.sim.task import TaskConfig, TrainConfig
 
 
@@ -51,7 +52,6 @@ GOALS = {
     "effects_over_none": (0.80, "environment with five joint effects over none"),
     "record_s": (20.0, "seconds to record 60 s of a suspended robot with three gain sets (at most)"),
     "gpu_env_over_bare": (0.70, "environment over bare mujoco-warp of the same model"),
-    "gpu_net_over_bare": (0.55, "the same with an actuator net"),
     "gpu_train_over_env": (0.65, "training over environment"),
     "gpu_train_over_numpy": (1.0, "training over training through SB3's own loop"),
     "paper_minutes": (30.0, "minutes for the paper's 491 M steps (at most)"),
@@ -86,25 +86,25 @@ def _task(container: dict[str, Any]) -> None:
 
     from go1exp.evaluate.bench import env
 
-    timing = (settings.num_envs, settings.rounds, settings.seconds, show)
+    much = env.Measured(settings.num_envs, settings.rounds, settings.seconds, show)
     if settings.suite == "env":
-        figures = env.run(config.task, overrides, *timing)
+        figures = env.run(config.task, overrides, much)
     elif settings.suite == "train":
-        figures = env.train(config, *timing)
+        figures = env.train(config, much)
     elif settings.suite == "deploy":
         from go1exp.evaluate.bench import deploy
 
-        figures = deploy.run(container, *timing)
+        figures = deploy.run(container, much)
     elif settings.suite == "report":
         from go1exp.evaluate.bench import report
 
         figures = report.run(container, show)
     elif settings.suite == "mpc":
-        figures = _mpc(config.task, timing)
+        figures = _mpc(config.task, much)
     elif on_gpu:
-        figures = _gpu(config, overrides, timing)
+        figures = _gpu(config, overrides, much)
     else:
-        figures = _actuator(config.task, timing)
+        figures = _actuator(config.task, much)
     about = " ".join(settings.overrides) or "defaults"
     print(f"suite={settings.suite} N={settings.num_envs} ({about})\n{env.machine()}\n")
     for name, value in figures.items():
@@ -118,27 +118,27 @@ def _task(container: dict[str, Any]) -> None:
         print(f"\nwritten to {out}")
 
 
-def _actuator(task: TaskConfig, timing: tuple[Any, ...]) -> dict[str, float]:
+def _actuator(task: TaskConfig, much: Measured) -> dict[str, float]:
     import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
     from go1exp.evaluate.bench import actuator
 
     record = compose("record")
     wanted = {f.name for f in fields(RecordSettings)}
     settings = parse(RecordSettings, {k: v for k, v in record.items() if k in wanted})
-    return actuator.run(task, settings.sensors, settings.physics_dt, *timing)
+    return actuator.run(task, settings.sensors, settings.physics_dt, much)
 
 
-def _mpc(task: TaskConfig, timing: tuple[Any, ...]) -> dict[str, float]:
+def _mpc(task: TaskConfig, much: Measured) -> dict[str, float]:
     """Run the suite of the model predictive controller, with its own settings."""
     from go1exp.cli import subjects
     from go1exp.evaluate.bench import deploy
 
     settings = subjects.chosen_controller(compose("record")["controller"])
     assert settings is not None
-    return deploy.run_mpc(task, settings, *timing[1:])
+    return deploy.run_mpc(task, settings, much)
 
 
-def _gpu(config: TrainConfig, overrides: list[str], timing: tuple[Any, ...]) -> dict[str, float]:
+def _gpu(config: TrainConfig, overrides: list[str], much: Measured) -> dict[str, float]:
     """Run the suite that needs a GPU, and name that."""
     import torch
 
@@ -147,7 +147,7 @@ def _gpu(config: TrainConfig, overrides: list[str], timing: tuple[Any, ...]) -> 
     from go1exp.evaluate.bench import gpu
 
     print(gpu.gpu())
-    return gpu.run(config, overrides, *timing)
+    return gpu.run(config, overrides, much)
 
 
 APP = App("bench", _task, BenchSettings)

@@ -5,11 +5,10 @@ from __future__ import annotations
 import dataclasses
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 from go1exp.config.schema.registry import Term, members
-from go1exp.evaluate.bench.env import core_subject, rates, ratio, speeds
+from go1exp.evaluate.bench.env import Measured, core_subject, rates, ratio, speeds
 from go1exp.gap.actuator_net.fitting import fit
 from go1exp.gap.actuator_net.settings import FitSettings
 from go1exp.logs import recording
@@ -49,15 +48,7 @@ def record_seconds(rig: simulate.Rig, sensors: SensorConfig, folder: Path) -> fl
     return time.perf_counter() - start
 
 
-def run(
-    task: TaskConfig,
-    sensors: SensorConfig,
-    record_dt: float,
-    num_envs: int,
-    rounds: int,
-    seconds: float,
-    on_round: Callable[[int, int], None],
-) -> dict[str, float]:
+def run(task: TaskConfig, sensors: SensorConfig, record_dt: float, much: Measured) -> dict[str, float]:
     """Measure; return the figures by name. Recordings are simulated at ``record_dt``, s."""
     rig = simulate.Rig(task.robot, task.actuator, (), task.terrain, task.backend, record_dt)
     with tempfile.TemporaryDirectory() as name:
@@ -65,11 +56,11 @@ def run(
         net = Term("net", members("actuator")["net"], {"file": str(small_net(rig, sensors, folder)), "period": "exact"})
         effects = tuple(Term(key, members("effect")[key], values, {"spread": {}}) for key, values in EFFECTS.items())
         subjects = {
-            "pd": core_subject(task, num_envs),
-            "net": core_subject(dataclasses.replace(task, actuator=net), num_envs),
-            "effects": core_subject(dataclasses.replace(task, effect=effects), num_envs),
+            "pd": core_subject(task, much.num_envs),
+            "net": core_subject(dataclasses.replace(task, actuator=net), much.num_envs),
+            "effects": core_subject(dataclasses.replace(task, effect=effects), much.num_envs),
         }
-        measured = rates(subjects, rounds, seconds, on_round)
+        measured = rates(subjects, much)
         recorded = record_seconds(rig, sensors, folder)
     return {
         **speeds(measured),

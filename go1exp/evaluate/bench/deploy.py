@@ -33,8 +33,8 @@ from go1exp.deploy.runtime.go1_wire import (
     unpack_state,
 )
 from go1exp.deploy.runtime.launch import RobotError, SimulatedRobot
-from go1exp.deploy.runtime.loop import Timing
 from go1exp.deploy.runtime.loop import run as loop
+from go1exp.evaluate.bench.env import Measured
 from go1exp.evaluate.controller.batch import Driven
 from go1exp.evaluate.controller.mpc import Mpc
 from go1exp.evaluate.controller.settings import MpcSettings
@@ -52,9 +52,7 @@ LITTLE = {"num_envs": 4, "steps": 4, "minibatches": 2, "epochs": 1, "iterations"
 """Settings of a training that takes a moment."""
 
 
-def run(
-    container: dict[str, Any], num_envs: int, rounds: int, seconds: float, on_round: Callable[[int, int], None]
-) -> dict[str, float]:
+def run(container: dict[str, Any], much: Measured) -> dict[str, float]:
     """Measure; return the medians over the rounds by name. ``container`` is a training's configuration."""
     little = container | {"ppo": container["ppo"] | LITTLE}
     results: list[dict[str, float]] = []
@@ -66,19 +64,13 @@ def run(
         file = place / "walk.zip"
         file.write_bytes(data)
         bundle = loads(data, str(file))
-        for k in range(rounds):
-            idle = loop(lambda now: True, RATE, seconds)
-            results.append(
-                _walk(file, seconds, place / str(k))
-                | {"policy_us": _policy(bundle), "packets_us": _packets()}
-                | _jitter(idle)
-            )
-            on_round(k + 1, rounds)
+        for k in range(much.rounds):
+            idle = loop(lambda now: True, RATE, much.seconds)
+            jitter = {"idle_missed_400hz": 100.0 * idle.missed_share, "idle_period_p99_ms": 1e3 * idle.period_p99}
+            calls = {"policy_us": _policy(bundle), "packets_us": _packets()}
+            results.append(_walk(file, much.seconds, place / str(k)) | calls | jitter)
+            much.on_round(k + 1, much.rounds)
     return {name: float(np.median([one[name] for one in results])) for name in results[0]}
-
-
-def _jitter(idle: Timing) -> dict[str, float]:
-    return {"idle_missed_400hz": 100.0 * idle.missed_share, "idle_period_p99_ms": 1e3 * idle.period_p99}
 
 
 def _policy(bundle: Bundle) -> float:
@@ -160,25 +152,23 @@ class _Timed:
         return drive
 
 
-def run_mpc(
-    task: TaskConfig, settings: MpcSettings, rounds: int, seconds: float, on_round: Callable[[int, int], None]
-) -> dict[str, float]:
-    """Walk ``seconds`` of simulated time in each round; return medians over the rounds of percentiles, ms."""
+def run_mpc(task: TaskConfig, settings: MpcSettings, much: Measured) -> dict[str, float]:
+    """Walk the seconds of simulated time in each round; return medians over the rounds of percentiles, ms."""
     task = dataclasses.replace(task, rand=(), event=())
     results = []
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        for k in range(rounds):
+        for k in range(much.rounds):
             times: list[float] = []
             core = Go1Core(task, len(COMMANDS), k, noise=False, imu=True)
             driven = Driven(core, lambda times=times: _Timed(Mpc(settings), times), noise=True, seed=k)  # type: ignore[misc]
             observation = core.reset()
-            for _ in range(max(round(seconds / core.task.sim.policy_dt), 1)):
+            for _ in range(max(round(much.seconds / core.task.sim.policy_dt), 1)):
                 core.command.value.copy_(torch.tensor(COMMANDS))
                 observation = core.step(driven(observation)).observation
             results.append(1e3 * np.percentile(times, [50, 99]))
-            on_round(k + 1, rounds)
+            much.on_round(k + 1, much.rounds)
     finally:
         torch.set_num_threads(threads)
     p50, p99 = np.median(results, axis=0)

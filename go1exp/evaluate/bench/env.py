@@ -44,21 +44,29 @@ class Subject:
     work: Callable[[], int]
 
 
-def rates(
-    subjects: Mapping[str, Subject], rounds: int, seconds: float, on_round: Callable[[int, int], None]
-) -> dict[str, list[float]]:
+@dataclass(frozen=True)
+class Measured:
+    """How much is measured, and what is told of the progress."""
+
+    num_envs: int  # environments of a batch
+    rounds: int
+    seconds: float  # of each subject in each round
+    on_round: Callable[[int, int], None]  # called with the rounds that are done, and all
+
+
+def rates(subjects: Mapping[str, Subject], much: Measured) -> dict[str, list[float]]:
     """Return the steps per second of each subject in each round; a warm-up unit of each does not count."""
     for subject in subjects.values():
         subject.work()
     measured: dict[str, list[float]] = {name: [] for name in subjects}
-    for k in range(rounds):
+    for k in range(much.rounds):
         for name, subject in subjects.items():
             steps, start = 0, time.perf_counter()
             # Whole units only: the time is taken after the last one.
-            while (elapsed := time.perf_counter() - start) < seconds:
+            while (elapsed := time.perf_counter() - start) < much.seconds:
                 steps += subject.work()
             measured[name].append(steps / elapsed)
-        on_round(k + 1, rounds)
+        much.on_round(k + 1, much.rounds)
     return measured
 
 
@@ -186,19 +194,12 @@ def memory_per_env_kb(overrides: list[str], few: int = 1, many: int = 2048) -> f
     return (peak(many) - peak(few)) / (many - few)
 
 
-def run(
-    task: TaskConfig,
-    overrides: list[str],
-    num_envs: int,
-    rounds: int,
-    seconds: float,
-    on_round: Callable[[int, int], None],
-) -> dict[str, float]:
+def run(task: TaskConfig, overrides: list[str], much: Measured) -> dict[str, float]:
     """Measure; return the figures by name."""
     subproc, close = subproc_subject(task)
-    subjects = {"env": core_subject(task, num_envs), "bare": bare_subject(task, num_envs), "subproc": subproc}
+    subjects = {"env": core_subject(task, much.num_envs), "bare": bare_subject(task, much.num_envs)}
     try:
-        measured = rates(subjects, rounds, seconds, on_round)
+        measured = rates(subjects | {"subproc": subproc}, much)
     finally:
         close()
     return {
@@ -221,14 +222,9 @@ def learning(ppo: AdaptivePPO, config: TrainConfig, label: str, finish: Callable
     return Subject(label, work)
 
 
-def train(
-    config: TrainConfig, num_envs: int, rounds: int, seconds: float, on_round: Callable[[int, int], None]
-) -> dict[str, float]:
+def train(config: TrainConfig, much: Measured) -> dict[str, float]:
     """Measure; return the figures by name."""
-    config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, num_envs=num_envs))
-    subjects = {
-        "train": learning(trainer.build(config), config, "training"),
-        "env": core_subject(config.task, num_envs),
-    }
-    measured = rates(subjects, rounds, seconds, on_round)
+    config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, num_envs=much.num_envs))
+    training = learning(trainer.build(config), config, "training")
+    measured = rates({"train": training, "env": core_subject(config.task, much.num_envs)}, much)
     return {**speeds(measured), "train_over_env": ratio(measured, "train", "env")}

@@ -9,14 +9,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import torch
 
 from go1exp import robot
 from go1exp.config.schema.joint_values import spread
-from go1exp.config.schema.registry import ConfigError, Term, members
-from go1exp.evaluate.bench.env import ACTION_SCALE, Subject, learning, rates, ratio, speeds
+from go1exp.config.schema.registry import ConfigError
+from go1exp.evaluate.bench.env import ACTION_SCALE, Measured, Subject, learning, rates, ratio, speeds
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.engine import make_backend
 from go1exp.sim.env.sb3_env import Go1VecEnv
@@ -124,33 +123,20 @@ def first_update_seconds(overrides: list[str]) -> tuple[float, float]:
         return once(cache), once(cache)
 
 
-def run(
-    config: TrainConfig,
-    overrides: list[str],
-    num_envs: int,
-    rounds: int,
-    seconds: float,
-    on_round: Callable[[int, int], None],
-    net: Path | None = None,
-) -> dict[str, float]:
-    """Measure; return the figures by name, also of an actuator ``net``; raise ConfigError of another backend."""
+def run(config: TrainConfig, overrides: list[str], much: Measured) -> dict[str, float]:
+    """Measure; return the figures by name; raise ConfigError of another backend."""
     if not config.task.backend.on_gpu:
         raise ConfigError(["suite=gpu needs backend=warp on a CUDA device"])
-    config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, num_envs=num_envs))
-    subjects = {"bare": bare_subject(config.task, num_envs), "env": env_subject(config.task, num_envs)}
-    if net is not None:
-        actuator = Term("net", members("actuator")["net"], {"file": str(net), "period": "exact"})
-        subjects["net"] = env_subject(dataclasses.replace(config.task, actuator=actuator), num_envs)
+    config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, num_envs=much.num_envs))
+    subjects = {"bare": bare_subject(config.task, much.num_envs), "env": env_subject(config.task, much.num_envs)}
     training = learning(trainer.build(config), config, "training", torch.cuda.synchronize)
     subjects |= {"train": training, "numpy": border_subject(config)}
-    measured = rates(subjects, rounds, seconds, on_round)
-    cold, warm = first_update_seconds([*overrides, f"ppo.num_envs={num_envs}"])
+    measured = rates(subjects, much)
+    cold, warm = first_update_seconds([*overrides, f"ppo.num_envs={much.num_envs}"])
     speed = speeds(measured)
-    with_net = {"gpu_net_over_bare": ratio(measured, "net", "bare")} if net is not None else {}
     return {
         **speed,
         "gpu_env_over_bare": ratio(measured, "env", "bare"),
-        **with_net,
         "gpu_train_over_env": ratio(measured, "train", "env"),
         "gpu_train_over_numpy": ratio(measured, "train", "numpy"),
         "paper_minutes": PAPER_STEPS / speed["train_steps_per_s"] / 60.0,
