@@ -12,7 +12,7 @@ from pydantic import Field
 
 from go1exp.cli import subjects
 from go1exp.cli.app import App, announce, parse, spinner
-from go1exp.cli.places import checkpoint_file, trained, writable
+from go1exp.cli.places import writable
 from go1exp.cli.subjects import Named, agent
 from go1exp.config.choices import config_folder, load
 from go1exp.config.schema import settings as schema
@@ -262,17 +262,17 @@ def _task(container: dict[str, Any]) -> None:
         raise ConfigError([f"checkpoint = {settings.checkpoint!r}: is of a policy; controller=mpc has none"])
     if not protocols and settings.folder is not None:
         raise ConfigError([f"folder = {settings.folder!r}: is of other protocols; the file of protocol=grid is out="])
+    subject = None
     if grid_too:
         _check_grid(settings)
-    subject = _of_grid(settings, conditions.controller) if grid_too else None
-    if subject:
-        out = subject[2]
+        subject = subjects.subject_of(settings, conditions.controller, "eval.json", settings.out)
+        out = subject.folder
         writable_file(out)
         note_replaced(out.parent, [out.name, out.with_suffix(".parquet").name], "out=FILE")
     if protocols:
         _protocols(settings, protocols, conditions)
     if subject:
-        _grid(settings, measures, conditions, *subject)
+        _grid(settings, measures, conditions, subject)
 
 
 def _check_grid(settings: Any) -> None:
@@ -283,18 +283,7 @@ def _check_grid(settings: Any) -> None:
         raise ConfigError(["grid: with cross=true every axis needs at least one value, such as grid.yaw=[0.0]"])
 
 
-def _of_grid(settings: Any, controller: MpcSettings | None) -> tuple[Path, Path | None, Path]:
-    """Return run, checkpoint and report; raise ConfigError if they are not there."""
-    if controller is not None:
-        run, out = subjects.controlled(settings.run, settings.policy, "eval.json", settings.out)
-        return run, None, out
-    run, out = trained(settings.run, settings.policy, "eval.json", settings.out)
-    return run, checkpoint_file(run, settings.checkpoint), out
-
-
-def _grid(
-    settings: Any, measures: list[Term], conditions: _Conditions, run: Path, checkpoint: Path | None, out: Path
-) -> None:
+def _grid(settings: Any, measures: list[Term], conditions: _Conditions, subject: Named) -> None:
     show = spinner(1, "evaluating", at_once=True)
     from go1exp.config.schema.settings import subset
     from go1exp.evaluate import criteria, table
@@ -302,9 +291,10 @@ def _grid(
     from go1exp.evaluate.rollout import EvalConfig, delay_margin, evaluate, grid
     from go1exp.train.policy import load_run
 
-    policy, make = None, None
+    policy, make, run = None, None, subject.run
+    assert run is not None
     if conditions.controller is None:
-        of_run, policy, about = load_run(run, checkpoint)
+        of_run, policy, about = load_run(run, subject.checkpoint)
         task = of_run.task
     else:
         task = subjects.task_of_run(run)
@@ -322,9 +312,9 @@ def _grid(
         falls = report["distinct_falls"]
         report["delay_margin"] = delay_margin(task, policy, config, falls, spinner(1, "with a delay"), make)
     report["criteria"] = [dataclasses.asdict(verdict) for verdict in criteria.evaluated(report)]
-    write_report(report, out)
+    write_report(report, subject.folder)
     print(table.text(report))
-    print(f"\nwritten to {out}")
+    print(f"\nwritten to {subject.folder}")
 
 
 APP = App("eval", _task, EvalSettings)

@@ -29,7 +29,7 @@ FORMATS = (".mp4", ".gif")  # endings of a clip's file; the picture beside it is
 def _task(container: dict[str, Any]) -> None:
     engine, container = subjects.split_engine(container)
     other, container = subjects.split_robot(container)
-    ground = _ground(container.pop("terrain", None))
+    ground = _ground(container)
     settings = parse(PlaySettings, container)
     where = address(settings.host, settings.port)
     if settings.log is not None:
@@ -68,17 +68,12 @@ def _task(container: dict[str, Any]) -> None:
     _show(core, drives.begin(core, "exact", settings.seed), settings, out, progress)
 
 
-def _ground(given: Any) -> TerrainConfig | None:
-    """Return the ground that the group ``terrain`` names, None without it; raise ConfigError if it is none."""
-    if given is None:
-        return None
-    from go1exp.sim.task import parse_parts
+def _ground(container: dict[str, Any]) -> TerrainConfig | None:
+    """Take out and return the ground that the group ``terrain`` names, None without it; raise ConfigError if none."""
+    from go1exp.sim.task import required_parts
 
-    parts, problems = parse_parts({"terrain": given}, ("terrain",))
-    if problems:
-        raise ConfigError(problems)
-    ground: TerrainConfig = parts["terrain"]
-    return ground
+    given = container.pop("terrain", None)
+    return None if given is None else required_parts({"terrain": given})["terrain"]
 
 
 def _log(settings: PlaySettings, where: tuple[str, int]) -> None:

@@ -218,11 +218,11 @@ def log(file: Path, where: tuple[str, int]) -> None:
     from go1exp.evaluate.viewer import web
     from go1exp.evaluate.viewer.replay import ReplayShow, of_recording
     from go1exp.evaluate.viewer.replay_window import ReplayWindow
-    from go1exp.sim.task import parse_parts
+    from go1exp.sim.task import required_parts
 
-    parts, _ = parse_parts({"robot": load(config_folder() / "robot" / "go1.yaml")}, ("robot",))
+    robot = required_parts({"robot": load(config_folder() / "robot" / "go1.yaml")})["robot"]
     story = of_recording(recording)
-    show = ReplayShow(story, parts["robot"])
+    show = ReplayShow(story, robot)
     web.run(show, [ReplayWindow(story)], title=f"go1exp: {file.name}", host=where[0], port=where[1])
 
 

@@ -44,13 +44,10 @@ ROBOT_GROUPS = ("actuator", "effect", "contact")
 
 def split_robot(container: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the checked choices of another robot, by group, and other settings; raise ConfigError of problems."""
-    from go1exp.sim.task import parse_parts
+    from go1exp.sim.task import required_parts
 
     chosen = {name: container[name] for name in ROBOT_GROUPS if container.get(name) is not None}
-    parts, problems = parse_parts(chosen, tuple(chosen))
-    if problems:
-        raise ConfigError(problems)
-    return parts, {name: value for name, value in container.items() if name not in ROBOT_GROUPS}
+    return required_parts(chosen), {name: value for name, value in container.items() if name not in ROBOT_GROUPS}
 
 
 def with_robot(task: TaskConfig, parts: dict[str, Any]) -> TaskConfig:
@@ -90,16 +87,6 @@ def chosen_controller(given: Any) -> MpcSettings | None:
     return settings
 
 
-def controlled(run: str | None, policy: str | None, file: str, out: str | None) -> tuple[Path, Path]:
-    """Return the folder of the run whose robot another controller moves, and the file for results.
-
-    The run is the one or the shipped policy that is named, else ``CONDITIONS``; the file is ``out``, or ``mpc_FILE``
-    here. Arguments and errors are those of ``places.trained``.
-    """
-    folder, results = trained(run, CONDITIONS if run is None and policy is None else policy, file, out)
-    return folder, results if out else Path(f"mpc_{file}")
-
-
 def task_of_run(run: Path) -> TaskConfig:
     """Return the task of a run folder."""
     from go1exp.train import run_folder
@@ -126,26 +113,31 @@ class Named:
     controller: MpcSettings | None = None  # in place of a policy; ``run`` then names the run of the robot that it moves
 
 
-def driven(controller: MpcSettings, run: str | None, policy: str | None, bundle: str | None, file: str) -> Named:
-    """Return a controller as a subject, on the robot of a run or shipped policy; raise ConfigError of a bundle."""
-    if bundle is not None:
-        raise ConfigError([f"bundle = {bundle!r}: is a policy; controller=mpc takes none"])
-    folder, results = controlled(run, policy, file, None)
-    return Named("mpc", results, run=folder, controller=controller)
+def driven(controller: MpcSettings, run: str | None, policy: str | None, file: str, out: str | None = None) -> Named:
+    """Return a controller on the robot of a run or shipped policy, or of ``CONDITIONS``; results are in ``mpc_FILE``.
+
+    Arguments and errors are those of ``places.trained``.
+    """
+    folder, results = trained(run, CONDITIONS if run is None and policy is None else policy, file, out)
+    return Named("mpc", results if out else Path(f"mpc_{file}"), run=folder, controller=controller)
 
 
-def subject_of(settings: Any, controller: MpcSettings | None, file: str) -> Named:
-    """Return the subject of a verb's keys; ``file`` is what its results are called; errors as those below."""
+def subject_of(settings: Any, controller: MpcSettings | None, file: str, out: str | None = None) -> Named:
+    """Return the subject of a verb's keys; its results are ``out``, or called ``file``; errors as those below."""
     if controller is None:
-        return named(settings.run, settings.policy, settings.bundle, settings.checkpoint, file)
-    return driven(controller, settings.run, settings.policy, settings.bundle, file)
+        return named(settings.run, settings.policy, settings.bundle, settings.checkpoint, file, out)
+    if settings.bundle is not None:
+        raise ConfigError([f"bundle = {settings.bundle!r}: is a policy; controller=mpc takes none"])
+    return driven(controller, settings.run, settings.policy, file, out)
 
 
-def named(run: str | None, policy: str | None, bundle: str | None, checkpoint: str | None, file: str) -> Named:
+def named(
+    run: str | None, policy: str | None, bundle: str | None, checkpoint: str | None, file: str, out: str | None = None
+) -> Named:
     """Return the subject of the one key that is given, its results called ``file``; raise ConfigError of none."""
     if bundle is None:
-        folder, out = trained(run, policy, file, None)
-        return Named(policy or folder.name, out, run=folder, checkpoint=checkpoint_file(folder, checkpoint))
+        folder, results = trained(run, policy, file, out)
+        return Named(policy or folder.name, results, run=folder, checkpoint=checkpoint_file(folder, checkpoint))
     others = [f"{key} = {value!r}" for key, value in (("run", run), ("policy", policy)) if value is not None]
     if others:
         raise ConfigError([f"bundle = {bundle!r} and {' and '.join(others)}: only one of them"])
@@ -203,7 +195,7 @@ def word(given: str, file: str) -> Named:
     if given == "mpc":
         settings = chosen_controller(load(_choices("controller")[given]))
         assert settings is not None
-        return driven(settings, None, None, None, file)
+        return driven(settings, None, None, file)
     if given.endswith(".zip"):
         return _bundle(given, file)
     if given in shipped_policies():

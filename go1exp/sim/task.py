@@ -292,6 +292,14 @@ def parse_parts(container: Mapping[str, Any], wanted: tuple[str, ...]) -> tuple[
     return parts, problems
 
 
+def required_parts(container: Mapping[str, Any]) -> dict[str, Any]:
+    """Return every part of a configuration by name; raise ConfigError with every problem."""
+    parts, problems = parse_parts(container, tuple(container))
+    if problems:
+        raise ConfigError(problems)
+    return parts
+
+
 def time_rules(sim: SimConfig) -> list[str]:
     """Return what is wrong with the periods of a simulation: each must be a whole multiple of the next shorter one."""
     problems = []

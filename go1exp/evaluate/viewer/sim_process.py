@@ -293,15 +293,12 @@ def _run(
     import torch
 
     from go1exp.deploy.sim_robot.alone import serve
-    from go1exp.sim.task import parse_parts
+    from go1exp.sim.task import required_parts
 
     torch.set_num_threads(1)
     sys.setswitchinterval(SWITCH_S)
     try:
-        parts, problems = parse_parts(groups, tuple(groups))
-        if problems:
-            raise ConfigError(problems)
-        body = Body(**parts, tile=tile)
+        body = Body(**required_parts(groups), tile=tile)
         server = Server(Robot(body, config), config, address[1], address[0])
     except ConfigError as error:
         pipe.send(Refused(tuple(error.problems), settings=True))
