@@ -228,16 +228,11 @@ def rows_of(
     draws: Mapping[str, NDArray[np.float64]],
     measures: Mapping[str, Any],
 ) -> list[dict[str, Any]]:
-    """Return a row of plain data for each of N robots.
+    """Return a row of plain data for each of N robots, of which ``episodes`` neighbours have one command.
 
-    Args:
-        commands: (N, 3), m/s, m/s, rad/s.
-        episodes: robots of each command, neighbours; the k-th of each has the number k in its row.
-        errors: root mean square errors (N, 3), NaN where there is none.
-        fell: (N,).
-        moving_s: time until a fall (N,), s.
-        draws: what was drawn for the robots, (N,) each by name.
-        measures: measures of gait and contact, (N,) or (N, 4) each by name.
+    They are numbered as those of other commands are. ``errors`` are root mean squares, NaN where there is none;
+    ``moving_s`` is the time until a fall, s; ``draws`` is what was drawn for the robots, (N,) each by name,
+    ``measures`` are those of gait and contact, (N,) or (N, 4).
     """
     planar = np.hypot(errors[:, 0], errors[:, 1])
     figures = np.column_stack([planar, errors])

@@ -307,12 +307,10 @@ def delay_margin(
     on_step: Callable[[int, int], None] = lambda done, total: None,
     controller: Callable[[], Controller] | None = None,
 ) -> dict[str, Any]:
-    """Run the grid of ``evaluate`` with growing command delay until a robot falls.
+    """Run the grid of ``evaluate`` with growing command delay until a robot falls; return the largest without, ``ms``.
 
-    A delay of the actuator stays, and the margin is added to it. ``falls`` are the ``distinct_falls`` without any.
-
-    Returns:
-        ``ms``, the largest delay without falls, None if robots fall without any; ``falls`` of each delay that was run.
+    A delay of the actuator stays, and the margin is added to it. ``falls`` are the ``distinct_falls`` without any, and
+    of each delay that was run in what is returned; ``ms`` is None if robots fall without any.
     """
     runs, margin = {"0": falls}, None if falls["count"] else 0
     for ms in DELAYS_MS:

@@ -56,16 +56,11 @@ LEGS = robot.NUM_LEGS
 
 
 class Feet:
-    """Schedule and contact of the four feet.
+    """Schedule and contact of the four feet: which stand (``down``), and where they left the ground and stand, m.
 
     A foot lifts off by the schedule. It stands at its contact: early, in the second half of its swing, or after the
-    scheduled touch-down.
-
-    Attributes:
-        down: (4,) bool, standing feet.
-        lift: (4, 3) position of each foot's last lift-off, m.
-        anchor: (4, 3) position of each foot's present or last stance, m.
-        overdue: (4,) time since the scheduled touch-down of feet without contact, s; 0 for the others.
+    scheduled touch-down; ``overdue`` is the time since that without contact, s, 0 for the others. ``anchor`` is where
+    each stands or last stood.
     """
 
     def __init__(self, contact_force: float, dt: float) -> None:
@@ -116,17 +111,10 @@ def footholds(
     stance: float,
     legs: np.ndarray,
 ) -> np.ndarray:
-    """Return footholds (n, 2) relative to the trunk's origin, m; all in the axes of the robot's heading.
+    """Return footholds (n, 2) of ``legs`` (n,) from the trunk's origin, m; all in the axes of the robot's heading.
 
-    Below the position of the hip in mid-stance (Raibert 1986), plus ``velocity_gain`` times the error of the velocity.
-
-    Args:
-        settings: ``velocity_gain``.
-        velocity: (3,) of the trunk, m/s.
-        command: commanded velocity, m/s, m/s, rad/s.
-        left: (n,) time until each touch-down, s.
-        stance: duration of the stance, s.
-        legs: (n,) indices of the legs.
+    Below the position of the hip in mid-stance (Raibert 1986), plus ``velocity_gain`` times the error of the trunk's
+    ``velocity`` (3,), m/s. ``left`` (n,) is the time until each touch-down, ``stance`` the duration of the stance, s.
     """
     vx, vy, _ = velocity.tolist()
     x, y, yaw = command
@@ -139,16 +127,10 @@ def footholds(
 def way(
     start: np.ndarray, end: np.ndarray, height: float, share: np.ndarray, duration: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return position (n, 3), m, and velocity (n, 3), m/s, of swinging feet.
+    """Return position (n, 3), m, and velocity (n, 3), m/s, of feet on their way from ``start`` to ``end``, m.
 
-    Horizontally a cubic from rest to rest; vertically the same plus a bump 16 s^2 (1 - s)^2.
-
-    Args:
-        start: (n, 3) positions of lift-off, m.
-        end: (n, 3) footholds, m.
-        height: of the bump, m.
-        share: (n,) passed share of the swing, 0 to 1.
-        duration: of the swing, s.
+    Horizontally a cubic from rest to rest in ``duration`` s; vertically the same plus a bump 16 s^2 (1 - s)^2 of
+    ``height`` m. ``share`` (n,) of the swing has passed.
     """
     left = share * (1.0 - share)
     blend, rate = share * share * (3.0 - 2.0 * share), 6.0 / duration * left

@@ -100,12 +100,9 @@ class Ground:
         self._fresh = True
 
     def update(self, feet: np.ndarray, down: np.ndarray, velocity: np.ndarray) -> None:
-        """Update by the positions (4, 3) of the feet relative to the trunk's origin in the world's axes, m.
+        """Update by where the feet (4, 3) stand or last stood, relative to the trunk's origin in the world's axes, m.
 
-        Args:
-            feet: where each stands or last stood.
-            down: (4,) bool, which ones stand now.
-            velocity: (3,) of the trunk, m/s.
+        ``down`` (4,) says which stand now; ``velocity`` (3,) is the trunk's, m/s.
         """
         if self._settings.slope:
             share = 1.0 if self._fresh else self._share

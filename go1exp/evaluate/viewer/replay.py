@@ -115,13 +115,7 @@ Request = Choose | Seek | Play | Magnify
 
 
 class Player:
-    """Position in a story.
-
-    Attributes:
-        time: s from its beginning.
-        speed: s of the recording per s.
-        magnify: factor by which errors are magnified.
-    """
+    """Position in a story: ``time`` in s, ``speed`` in s of it per s, and the factor by which errors are magnified."""
 
     def __init__(self, story: Story) -> None:
         """Start at the beginning; windows of a gap are short, and shown slowly."""
