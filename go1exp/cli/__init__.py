@@ -128,10 +128,7 @@ def _run(verb: str, rest: list[str]) -> int:
 
 
 def _by_name(verb: str, arguments: list[str]) -> list[str]:
-    """Turn arguments by position into ``key=value``: those that are no override, no option and no option's value.
-
-    Options come first: Hydra's parser takes none between overrides.
-    """
+    """Turn words by position into ``key=value``, options first: Hydra's parser takes none between overrides."""
     options, settings, words = parted(arguments)
     named = []
     for key in POSITIONAL.get(verb, ()):

@@ -211,10 +211,7 @@ def announce(what: str) -> None:
 
 
 def spinner(total: int, what: str, at_once: bool = False) -> Callable[[int, int], None]:
-    """Return a callback ``(done, total)`` that shows a progress bar in a terminal, and lines elsewhere.
-
-    The first line comes after a while, or ``at_once``.
-    """
+    """Return a callback ``(done, total)``: a progress bar in a terminal, else lines, after a while or ``at_once``."""
     if at_once:
         announce(what)
     if not sys.stderr.isatty():

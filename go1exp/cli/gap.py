@@ -257,10 +257,7 @@ def _status(result: GapResult, out: Path) -> int:
 
 
 def _print_next(effects: dict[str, Any], robot: Robot, file: Path, contact: ContactConfig | None = None) -> None:
-    """Print how to train with the effects in ``file``, if there are any, and a robot that is trained.
-
-    The command names a contact that is not MuJoCo's own, which is the default of training.
-    """
+    """Print how to train with the effects in ``file``, if there are any, and contact that is not MuJoCo's own."""
     from go1exp.robot import JOINTS
 
     if not effects:

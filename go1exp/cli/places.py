@@ -106,10 +106,7 @@ def remove_empty(folder: Path) -> None:
 
 
 def long_enough(recordings: list[Recording], least: float) -> list[Recording]:
-    """Return the recordings that windows of ``least`` s can be cut from, and print which are left out and why.
-
-    Times in a wrong unit are recognised as by the audit (``wrong_steps``).
-    """
+    """Return the recordings that windows of ``least`` s can be cut from; print which are left out, and why."""
     from go1exp.logs.audit.signals import Log
     from go1exp.logs.audit.single import wrong_steps
 

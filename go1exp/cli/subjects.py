@@ -114,10 +114,7 @@ class Named:
 
 
 def driven(controller: MpcSettings, run: str | None, policy: str | None, file: str, out: str | None = None) -> Named:
-    """Return a controller on the robot of a run or shipped policy, or of ``CONDITIONS``; results are in ``mpc_FILE``.
-
-    Arguments and errors are those of ``places.trained``.
-    """
+    """Return a controller on the robot of a run or policy, or of ``CONDITIONS``; errors are those of ``trained``."""
     folder, results = trained(run, CONDITIONS if run is None and policy is None else policy, file, out)
     return Named("mpc", results if out else Path(f"mpc_{file}"), run=folder, controller=controller)
 

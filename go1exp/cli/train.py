@@ -97,10 +97,7 @@ class TrainJob:
 
 
 def resolved(container: dict[str, Any], overrides: list[str], run: Path) -> TrainJob:
-    """Return the training that a composed configuration stands for, in ``run`` unless it resumes; touches no file.
-
-    Raise ConfigError with everything that is wrong.
-    """
+    """Return the training of a configuration, in ``run`` unless it resumes; touches no file; raise ConfigError."""
     from go1exp.sim.task import parse_train
 
     config = parse_train(container)

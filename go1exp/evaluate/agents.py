@@ -178,10 +178,7 @@ class _RunningPolicy:
 
 @dataclass(frozen=True)
 class BundleAgent(Agent):
-    """The policy of a bundle as the robot's computer runs it: readings in, by ONNX.
-
-    Its noise is that of the robot's sensors (the simulated robot's of ``go1exp deploy``), not that of training.
-    """
+    """The policy of a bundle as the robot's computer runs it, by ONNX; noise is that of the robot's sensors."""
 
     bundle: Bundle
 

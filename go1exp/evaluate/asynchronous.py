@@ -26,10 +26,7 @@ NICE = 19  # lowest priority: the training comes first
 
 
 def score(rows: Sequence[dict[str, Any]], duration_s: float) -> float:
-    """Return the root mean square horizontal error, m/s, falls included; lower is better.
-
-    The error of a fallen robot is its command, and at least 1 m/s, for the rest of the episode.
-    """
+    """Return the root mean square horizontal error, m/s; of a fallen robot its command, and at least 1 m/s."""
     squares = []
     for row in rows:
         share = min(row["moving_s"] / duration_s, 1.0)

@@ -81,10 +81,7 @@ def evaluation_task(task: TaskConfig, config: EvalConfig) -> TaskConfig:
 
 
 def require_agreement(task: TaskConfig) -> list[Check]:
-    """Return the checks of a task's engine against MuJoCo, in the air; none for MuJoCo itself.
-
-    Raise Expected if it differs by more than the tolerances, or is not installed. Takes 0.25 s on one core for PhysX.
-    """
+    """Return the checks of an engine against MuJoCo, none for that; raise Expected if they fail, or without it."""
     if isinstance(task.backend, CpuBackend):
         return []
     ground = build_terrain(TerrainConfig(kind="flat"))

@@ -124,10 +124,7 @@ def _short(command: Any) -> str:
 
 
 def measure_tables(report: dict[str, Any]) -> list[list[tuple[str, ...]]]:
-    """Return the tables of gait, of contact and of further measures, each a header and one row per command.
-
-    A column of the first two for which no command has a figure is left out, a table without any, too.
-    """
+    """Return tables of gait, contact and further measures, a header and a row per command, without empty columns."""
     tables = []
     for columns in (GAIT, CONTACT):
         if filled := [column for column in _columns(report, columns) if {*column[1:]} != {NO_FIGURE}]:

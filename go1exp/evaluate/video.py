@@ -119,10 +119,7 @@ def evenly(total: int, count: int) -> list[int]:
 
 
 def keeping(frames: Iterable[Picture], total: int, kept: list[Picture], count: int = PANELS) -> Iterator[Picture]:
-    """Yield ``total`` pictures, and put ``count`` evenly spaced ones of them into ``kept``.
-
-    So a video of any length is written, and a strip made of it, without all pictures in memory.
-    """
+    """Yield ``total`` pictures, and put ``count`` evenly spaced ones into ``kept``: the rest needs no memory."""
     chosen = set(evenly(total, count))
     for k, picture in enumerate(frames):
         if k in chosen:
@@ -131,10 +128,7 @@ def keeping(frames: Iterable[Picture], total: int, kept: list[Picture], count: i
 
 
 def write_mp4(path: Path, frames: Iterable[Picture], fps: float = 25) -> None:
-    """Write an H.264 video that browsers play, frame by frame; no partial file is left.
-
-    Raise OSError if it cannot be written, and ValueError without frames.
-    """
+    """Write an H.264 video for browsers, frame by frame, or no file; raise OSError, or ValueError without frames."""
     frames = iter(frames)
     first = next(frames, None)
     if first is None:
@@ -149,10 +143,7 @@ def write_mp4(path: Path, frames: Iterable[Picture], fps: float = 25) -> None:
 
 
 def write_strip(path: Path, frames: Sequence[Picture], count: int = PANELS, size: int = 320) -> None:
-    """Write ``count`` evenly spaced frames side by side as a PNG, cropped to squares of ``size`` pixels.
-
-    Raise OSError if it cannot be written, and ValueError without frames.
-    """
+    """Write ``count`` evenly spaced frames as a PNG of squares; raise OSError, or ValueError without frames."""
     if not len(frames):
         raise ValueError(f"{path}: a strip needs at least one frame")
     chosen = evenly(len(frames), count)
@@ -243,10 +234,7 @@ def steer(command: list[float], key: int) -> None:
 
 
 def live(core: Go1Core, policy: Policy, env: int = 0) -> None:
-    """Show one environment in a window in real time until it is closed; the keyboard sets the command.
-
-    Raise RenderingUnavailable without a display, and NumericalFault when a value is not finite.
-    """
+    """Show an environment until its window is closed; raise RenderingUnavailable without display, or NumericalFault."""
     command = core.command.value[env].tolist()
     stage, dt = Stage(core), core.task.sim.policy_dt
     with _window(stage, lambda key: steer(command, key)) as window:
@@ -308,10 +296,7 @@ def _window(stage: Stage, on_key: Callable[[int], None]) -> Iterator[Any]:
 
 
 def poses_of(core: Go1Core, policy: Policy, seconds: float, count: int = 8) -> list[np.ndarray]:
-    """Run the policy in environment 0 and return ``count`` poses: world x, z of each leg's joints, (4, 4, 2), m.
-
-    The four points of a leg are hip, thigh joint, knee and foot.
-    """
+    """Return ``count`` poses of robot 0: world x, z (4, 4, 2), m, of each leg's hip, thigh joint, knee and foot."""
     data = mujoco.MjData(core.backend.model)
     steps = round(seconds / core.task.sim.policy_dt)
     wanted = set(np.linspace(steps // 2, steps - 1, count).astype(int).tolist())

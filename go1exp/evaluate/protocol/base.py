@@ -169,10 +169,7 @@ def rounded(values: ArrayLike) -> list[Any]:
 
 
 def bands(values: NDArray[np.float64], middle: Callable[..., Any]) -> NDArray[np.float64]:
-    """Return the ``middle`` and the 10th and 90th percentile over robots of values (T, N, ...), (3, T, ...).
-
-    NaNs are ignored; the result is NaN at times without any other value.
-    """
+    """Return ``middle``, 10th and 90th percentile over robots of values (T, N, ...), (3, T, ...); NaNs are ignored."""
     known = np.isfinite(values).reshape(len(values), -1).any(1)
     over = np.full((3, len(values), *values.shape[2:]), np.nan)
     if known.any():

@@ -44,10 +44,7 @@ class Metrics:
 
 
 def read(run: Path, wanted: Sequence[str]) -> tuple[Metrics, str]:
-    """Return the metrics of a run, and a remark in one line or an empty string.
-
-    Incomplete rows are skipped, and repeated iterations count once.
-    """
+    """Return a run's metrics, without incomplete rows and repeated iterations, and a remark, or an empty one."""
     metrics, remark = _table(run / "metrics.csv", ("iteration", "steps", *wanted))
     columns, timing = metrics.columns, _table(run / "timing.csv", ("iteration", "steps", RATE))[0].columns
     if len(columns.get("steps", ())) and len(timing.get(RATE, ())):

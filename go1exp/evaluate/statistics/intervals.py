@@ -25,10 +25,7 @@ class Interval:
 
 
 def constant(values: ArrayLike, trim: float = 0.0) -> bool:
-    """Return whether values are equal up to rounding, ignoring NaNs and a share ``trim`` at each end.
-
-    Intervals and effect sizes of such values are undefined.
-    """
+    """Return whether values are equal up to rounding, but for NaNs and a share ``trim`` at each end."""
     each = np.asarray(values, dtype=np.float64).ravel()
     each = np.sort(each[np.isfinite(each)])
     cut = int(trim * len(each))
@@ -50,10 +47,7 @@ def mean_interval(values: ArrayLike) -> Interval:
 
 
 def phase_interval(phases: ArrayLike) -> Interval:
-    """Return the circular mean of one phase per robot, cycles in 0 to 1, and the interval of the deviations from it.
-
-    The bounds may lie beyond 0 and 1, so that low <= mean <= high.
-    """
+    """Return the circular mean of one phase per robot, cycles, with low <= mean <= high, which may pass 0 and 1."""
     each = np.asarray(phases, dtype=np.float64).ravel()
     each = each[np.isfinite(each)]
     mean = float(np.angle(np.exp(2j * np.pi * each).sum()) / (2.0 * np.pi) % 1.0) if len(each) else np.nan

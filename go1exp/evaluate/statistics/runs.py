@@ -33,10 +33,7 @@ def iqm(values: ArrayLike, axis: int | None = -1) -> Floats:
 
 
 def iqm_interval(values: ArrayLike) -> Interval:
-    """Return the interquartile mean of one value per run with its interval over runs; NaNs are ignored.
-
-    The interval is NaN with fewer than two runs. See ``iqm_band``.
-    """
+    """Return the interquartile mean of one value per run with its interval (``iqm_band``), NaN of fewer than two."""
     each = np.asarray(values, dtype=np.float64).ravel()
     each = each[np.isfinite(each)]
     if not len(each):
@@ -154,10 +151,7 @@ class Difference:
 
 
 def difference(group: ArrayLike, baseline: ArrayLike, paired: bool = False) -> Difference:
-    """Return the difference of the runs (n,) of a group from those (m,) of the baseline; NaNs are ignored.
-
-    ``paired`` pairs the k-th runs of both.
-    """
+    """Return the difference of the runs (n,) from the baseline's (m,), pair by pair if ``paired``; without NaNs."""
     a, b = np.asarray(group, dtype=np.float64), np.asarray(baseline, dtype=np.float64)
     if paired:
         both = np.isfinite(a) & np.isfinite(b)
@@ -222,10 +216,7 @@ def least_p(n: int, m: int, paired: bool = False) -> float:
 
 
 def runs_for_significance(paired: bool = False, figures: int = 1, alpha: float = ALPHA) -> int | None:
-    """Return the least number of runs per group with which one of ``figures`` comparisons can be significant.
-
-    None if no number suffices, for too many comparisons for the number of random permutations.
-    """
+    """Return the fewest runs per group for one of ``figures`` comparisons to be significant; None if none suffice."""
     if LEAST_RANDOM_P * figures > alpha:
         return None
     n = 2

@@ -117,10 +117,7 @@ def _ends(box: Mailbox) -> dict[str, Any]:
 
 
 def launch(target: Callable[[endpoints.ViewerEndpoint], None], plugins: list[Any]) -> viewer_handle.ViewerHandle:
-    """Run a viewer in a fork of this process, as ``mujoco.studio.launch_thread`` does in a thread; return our handle.
-
-    Its use raises ``Expected`` when the page ended by an error.
-    """
+    """Run a viewer in a fork, and return our handle, whose use raises ``Expected`` when the page ended by an error."""
     context = multiprocessing.get_context("fork")
     ours, theirs = context.Pipe()
 

@@ -135,10 +135,7 @@ _opening = threading.Lock()
 
 @contextmanager
 def _behind(gate: Gate, pad: Gamepad, sock: Any) -> Iterator[None]:
-    """Let the server that is created inside use ``sock``, ``gate`` and ``pad``.
-
-    Studio has no settings for them. ``_refuses_strangers`` verifies the gate of the running server.
-    """
+    """Let the server that is created inside use ``sock``, ``gate`` and ``pad``: Studio has no settings for them."""
     usual = web_server.serve, web_server.bind_public_socket, web_viewer._print_url_banner
     started = threading.Event()
 

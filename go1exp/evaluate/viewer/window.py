@@ -142,10 +142,7 @@ def arrow_shape(arrow: Arrow) -> Any:
 
 
 def paragraph(text: str, lines: int = 0) -> None:
-    """Write text broken between words (ImGui breaks within words), over at least ``lines`` lines.
-
-    The minimum keeps the controls below in place when the text changes.
-    """
+    """Write text broken between words, over at least ``lines`` lines, so that the controls below stay in place."""
     columns = int(imgui.GetContentRegionAvail().x / imgui.CalcTextSize("n").x)
     broken = textwrap.wrap(text, max(columns, 10))
     for line in broken + [""] * (lines - len(broken)):
