@@ -105,12 +105,8 @@ def evaluate(
     ``controller`` makes what moves one robot in place of the policy, by its own sensors.
     ``measures`` (``go1exp/mdp/measures``) are over the same time and over robots that differ: ``distinct`` of them.
     ``rows`` has one entry for each robot (``rows.py``), for a file of its own.
-    ``agreement`` has the differences of another engine from MuJoCo, checked first.
-
-    Raises:
-        Expected: if that is not near enough.
-        TooLongError: if what measures need does not fit into memory.
-        ConfigError: if no step is left after ``settle_s``.
+    ``agreement`` has the differences of another engine from MuJoCo, checked first: raise Expected if they are too
+    large, TooLongError if what measures need does not fit into memory, ConfigError if ``settle_s`` leaves no step.
     """
     count = len(config.commands) * config.episodes
     agent = _agent(task, policy, controller)

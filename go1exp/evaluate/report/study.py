@@ -86,11 +86,7 @@ class _Job:
 
 
 def study(folders: Sequence[str], unfinished: bool) -> Study:
-    """Return the runs below ``folders``, each once; ``unfinished`` includes those that are not done.
-
-    Raises:
-        ConfigError: if a folder is missing or holds no run, or if none of them has begun.
-    """
+    """Return the runs below ``folders``, each once; those not done if ``unfinished``; raise ConfigError without any."""
     given = [Path(folder) for folder in folders]
     if missing := [f"folders: {str(f)!r}: {_no_folder(f)}" for f in given if not f.is_dir()]:
         raise ConfigError(missing)

@@ -28,7 +28,6 @@ from go1exp.evaluate.viewer.walk import Series, Timed, push_arrow, runs_of
 from go1exp.evaluate.viewer.window import (
     MESSAGE_LINES,
     PLAIN,
-    TALL,
     Curves,
     EffectsPanel,
     PushPanel,
@@ -273,13 +272,7 @@ class SimWindow(Window):
         if section("True velocity"):
             lines = list(zip(("forward m/s", "left m/s", "yaw rad/s"), view.velocity, strict=True))
             self._plots.plot("##velocity", "", view, lines, (-1.5, 1.5))
-        if section("Contacts"):
-            self._plots.contacts(view)
-        if section("Trunk height"):
-            self._plots.plot("##height", "m", view, [("height", view.height)], (0.0, 0.5))
-        if section("Torque / limit"):
-            lines = list(zip(robot.JOINTS, view.torque, strict=True))
-            self._plots.plot("##torque", "-", view, lines, (0.0, 1.05), TALL)
+        self._plots.body(view)
 
     def _intervals(self, view: SimView) -> None:
         if not implot.BeginPlot("##intervals", Vec2(-1.0, PACKETS), PLAIN | int(implot.Flags.NoTitle)):

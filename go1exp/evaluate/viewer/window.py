@@ -246,6 +246,12 @@ class Curves:
         """Draw all sections that are unfolded."""
         if section("Velocity: commanded, true, estimated"):
             self._velocity(view)
+        self.body(view)
+        if section(f"Rewards: {len(view.rewards)} terms, {view.total:+.2f} per s"):
+            self._rewards(view.rewards)
+
+    def body(self, view: Timed) -> None:
+        """Draw the sections of contacts, height and torque."""
         if section("Contacts"):
             self.contacts(view)
         if section("Trunk height"):
@@ -253,8 +259,6 @@ class Curves:
         if section("Torque / limit"):
             lines = list(zip(robot.JOINTS, view.torque, strict=False))
             self.plot("##torque", "-", view, lines, (0.0, 1.05), TALL)
-        if section(f"Rewards: {len(view.rewards)} terms, {view.total:+.2f} per s"):
-            self._rewards(view.rewards)
 
     def _velocity(self, view: WalkView) -> None:
         for axis, (name, unit) in enumerate(VELOCITY_AXES):
