@@ -171,7 +171,8 @@ def standing(t: float, **changes: np.ndarray) -> np.ndarray:
 
 def test_the_go1s_feet_are_where_its_model_has_them() -> None:
     """In closed form, which is the model's and the vendor's: test_feet.py, test_robot_model.py."""
-    q = np.random.default_rng(0).uniform(*robot.JOINT_POS_LIMITS.T, (20, 12))
+    low, high = robot.JOINT_POS_LIMITS.T
+    q = np.random.default_rng(0).uniform(low, high, (20, 12))
     feet = np.array([[foot(leg, one[3 * k : 3 * k + 3])[0] for k, leg in enumerate(go1().legs)] for one in q])
     np.testing.assert_allclose(feet, foot_positions(torch.as_tensor(q)), atol=1e-5)
 
