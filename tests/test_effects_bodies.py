@@ -551,3 +551,18 @@ def test_a_gear_may_carry_more_than_the_drive_can_make() -> None:
     torque = plant.backend.applied()[0, CALVES]
     assert (torque > 50.0).all()
     assert ((plant.qd - before)[0, CALVES] > 0.0).all()
+
+
+@pytest.mark.slow("go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
+def test_free_play_between_upright_and_upside_down_is_the_gap() -> None:
+    gap, upside_down = 0.02, (0.0, 1.0, 0.0, 0.0)
+    q = {
+        (b, held): settle(rig({"backlash": {"gap": b}}, held=held, kp=400.0, kd=2.0), seconds=2.0)
+        for b in (0.0, gap)
+        for held in (LEVEL, upside_down)
+    }
+    rigid = q[0.0, LEVEL] - q[0.0, upside_down]
+    loose = q[gap, LEVEL] - q[gap, upside_down]
+    play = (loose - rigid) * rigid.sign()
+    assert torch.allclose(play[:, THIGHS], torch.full_like(play[:, THIGHS], gap), rtol=0.05)
+    assert torch.allclose(play[:, CALVES], torch.full_like(play[:, CALVES], gap), rtol=0.05)

@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from scipy.integrate import solve_ivp
 from scipy.signal import lsim
 from torch import Tensor
 
@@ -551,3 +552,35 @@ def test_without_a_share_from_outside_the_gears_feel_the_drive_alone_bit_for_bit
     effect: Any = term("effect", "load_friction", {"coefficient": 0.13})(drives(8))
     bound, torque, outside = noise(8, 1.0, 5).abs(), noise(8, 25.0, 6), noise(8, 9.0, 7)
     assert torch.equal(effect.on_load(bound, torque, outside), bound + effect.coefficient * torque.abs())
+
+
+def test_a_swing_without_a_drive_loses_what_the_loaded_gears_take() -> None:
+    """The calf falls from 1.2 rad beside the vertical; SciPy integrates I qdd = weight - friction of the weight."""
+    q = STANCE.clone()
+    q[0, CALF] = -2.6
+    gears = {"coefficient": {"FR_calf": 0.3}, "external": 1.0}
+    others = {"hip": 3.0, "thigh": 3.0, "calf": 3.0, "FR_calf": 0.0}
+    plant = stand({"coulomb": {"bound": others}, "load_friction": gears}, gravity=True, q=q, kp=0.0, kd=0.0, dt=0.001)
+    model = plant.backend.model
+    data, column = mujoco.MjData(model), np.zeros(model.nv)
+    data.qpos[:] = q[0]
+    mujoco.mj_forward(model, data)
+    mujoco.mj_mulM(model, data, column, np.eye(model.nv)[CALF])
+
+    def slopes(_: float, state: np.ndarray) -> list[float]:
+        data.qpos[CALF], data.qvel[CALF] = state
+        mujoco.mj_forward(model, data)
+        weight = -data.qfrc_bias[CALF]
+        return [state[1], (weight - 0.3 * abs(weight) * np.sign(state[1])) / column[CALF]]
+
+    found = []
+    for _ in range(150):
+        plant.step(q)
+        found.append(float(plant.q[0, CALF]))
+    expected = solve_ivp(slopes, (0.0, 0.15), [-2.6, 0.0], rtol=1e-8, atol=1e-10, first_step=1e-4).y[0, -1]
+    free = stand({"coulomb": {"bound": others}}, gravity=True, q=q, kp=0.0, kd=0.0, dt=0.001)
+    for _ in range(150):
+        free.step(q)
+    assert abs(expected + 2.6) > 0.1
+    assert abs(float(free.q[0, CALF]) - expected) > 0.05
+    assert found[-1] == pytest.approx(expected, abs=1e-3)
