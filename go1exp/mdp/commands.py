@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
-from torch import Tensor
 
 from go1exp.base.tensors.memory import Memory
 from go1exp.base.tensors.randomness import Stream
 from go1exp.config.schema.registry import Fraction, Positive, PositiveRange, Speed, SpeedRange, command
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 SLOW = 0.2
 """Share of the ranges that slow commands are drawn from."""

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import torch
 from pydantic import Field
-from torch import Tensor
 
 from go1exp.base.tensors.memory import Memory, constant_like
 from go1exp.base.tensors.rotation import quat_multiply, rotate_inverse
 from go1exp.config.schema.registry import curriculum
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 YAW_ARM = 0.25
 """Length that turns a yaw angle into a path, m: about the distance of a foot from the middle of the trunk."""

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
 from go1exp import robot
 from go1exp.base.tensors.memory import constant_like
 from go1exp.base.tensors.rotation import rotate
 from go1exp.mdp.types import Snapshot
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 NOMINAL_STANCE = tuple(robot.NOMINAL_STANCE.tolist())
 

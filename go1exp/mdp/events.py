@@ -7,17 +7,19 @@ bool. The time limit is none: it truncates, and belongs to ``sim.episode_s``.
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import torch
 from pydantic import Field
-from torch import Tensor
 
 from go1exp.base.tensors.memory import Memory
 from go1exp.base.tensors.randomness import Stream
 from go1exp.config.schema.registry import PositiveRange, SpeedRange, event, termination
 from go1exp.mdp.kinematics import KinematicState
 from go1exp.mdp.types import Snapshot
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @event("push")

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor
 
 from go1exp import robot
 from go1exp.base.tensors.memory import Memory
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 IMPOSSIBLE_FORCE = 5000.0
 """Force on a foot that no robot of 13 kg makes, N: 40 body weights. A physics step went wrong.

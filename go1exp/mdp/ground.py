@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
-from torch import Tensor
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 SCAN_ROWS, SCAN_COLUMNS = 17, 11
 """Points of a height scan along x, from behind to the front; in each of its rows along y, from right to left."""

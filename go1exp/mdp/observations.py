@@ -7,14 +7,18 @@ the term's image under a swap of left and right (``mdp/mirror.py``).
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
-from torch import Tensor
 
 from go1exp.config.schema.registry import NonNegative, Positive, observation
 from go1exp.mdp.derived import clock_angle, joint_deviation
 from go1exp.mdp.ground import SCAN_COLUMNS, SCAN_ROWS
 from go1exp.mdp.mirror import ACTION, AXIAL, CLOCK, COMMAND, JOINTS, LEGS, POLAR, grid
 from go1exp.mdp.types import Snapshot
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @observation("base_linear_velocity", size=3, mirror=POLAR)

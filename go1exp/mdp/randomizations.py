@@ -8,12 +8,11 @@ write the state of a reset. All draws are independent per element. Table I of th
 from __future__ import annotations
 
 import functools
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import torch
 from pydantic import AfterValidator, Field
-from torch import Tensor
 
 from go1exp import robot
 from go1exp.base.tensors.memory import constant_like
@@ -22,6 +21,9 @@ from go1exp.base.tensors.rotation import quat_from_rotvec, quat_multiply
 from go1exp.config.schema.registry import PositiveRange, Range, SpeedRange, ordered, randomization
 from go1exp.mdp.kinematics import KinematicState
 from go1exp.robot.actuators import ModelFields
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def restitution(damping_ratio: np.ndarray) -> np.ndarray:

@@ -14,9 +14,9 @@ second.
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
 from go1exp import robot
 from go1exp.base.tensors.memory import Memory, constant_like
@@ -33,6 +33,9 @@ from go1exp.mdp.derived import (
 )
 from go1exp.mdp.feet import LARGEST_PRICED_FORCE
 from go1exp.mdp.types import Snapshot, TermSetup
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @reward("feet_air_time")

@@ -6,14 +6,18 @@ These expressions are kept so that the claim "ill-posed" can be run. Several are
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
-from torch import Tensor
 
 from go1exp import robot
 from go1exp.base.tensors.memory import constant_like
 from go1exp.config.schema.registry import NonNegative, Positive, reward
 from go1exp.mdp.derived import foot_speed_xy, joint_deviation
 from go1exp.mdp.types import Snapshot
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @reward("feet_air_time_literal")

@@ -11,9 +11,12 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def _signed(x: int) -> int:

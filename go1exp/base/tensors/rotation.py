@@ -5,8 +5,12 @@ Everywhere else ``scipy.spatial.transform.Rotation`` is the tool.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
-from torch import Tensor
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def rotate(quat: Tensor, vector: Tensor) -> Tensor:

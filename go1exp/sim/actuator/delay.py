@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import torch
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
-from torch import Tensor
 
 from go1exp.base.tensors.memory import CommandLine
 from go1exp.config.schema.registry import actuator, bind, members, ordered
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.actuator.motors import Actuator, takes_feedforward
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def _checked(settings: dict[str, Any]) -> dict[str, Any]:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import inspect
-from typing import Annotated, Any, Protocol, TypeGuard, runtime_checkable
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeGuard, runtime_checkable
 
 import torch
-from torch import Tensor
 
 from go1exp.base.tensors.memory import Memory
 from go1exp.config.schema.joint_values import JointValues, each_within
 from go1exp.config.schema.registry import actuator
 from go1exp.robot.actuators import ActuatorSetup
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 class Actuator(Protocol):

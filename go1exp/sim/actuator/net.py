@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import torch
 from pydantic import AfterValidator
 from pydantic_core import PydanticKnownError
-from torch import Tensor
 
 from go1exp import robot
 from go1exp.base.paths import data_root
@@ -19,6 +18,8 @@ from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.actuator.grouped_mlp import GroupedMLP, padded_rows
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from go1exp.sim.actuator.actuator_net import NetInfo
 
 INPUTS = ("position_error", "velocity", "position")

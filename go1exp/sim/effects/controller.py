@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor
 
 from go1exp.base.tensors.memory import CommandLine
 from go1exp.config.schema.joint_values import JointValues
@@ -13,6 +12,9 @@ from go1exp.config.schema.registry import effect
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.robot.go1_fields import KD_STEP, KP_STEP, TORQUE_STEP
 from go1exp.sim.effects.base import SHARP_EDGES, TWO_ATTITUDES, TWO_GAIN_SETS, TWO_KD, Effect, Identification, Param
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @effect("dead_band")

@@ -23,14 +23,17 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
 from go1exp.base.tensors.memory import Memory
 from go1exp.config.schema.registry import effect
 from go1exp.robot.actuators import ActuatorSetup, ModelFields
 from go1exp.sim.effects.base import TWO_KD, Effect, Gears, Identification, Param
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @effect("asymmetric_friction")

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
 from go1exp.config.schema.registry import effect
 from go1exp.mdp.randomizations import damping_ratio
 from go1exp.robot.actuators import ModelFields
 from go1exp.sim.effects.base import LARGEST_ANGLE, LEAST_ANGLE, MEAN_ANGLE, Effect, Identification, Param, Periodic
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @effect("cogging")

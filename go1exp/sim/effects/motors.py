@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
 from go1exp.config.schema.joint_values import JointValues
 from go1exp.config.schema.registry import effect
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.actuator.motors import envelope
 from go1exp.sim.effects.base import TWO_GAIN_SETS, Effect, Identification, Param
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @effect("strength")

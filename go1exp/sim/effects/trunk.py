@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
-from torch import Tensor
 
 from go1exp.base.tensors.rotation import quat_multiply, rotate, rotate_inverse
 from go1exp.config.schema.joint_values import JointValues
@@ -15,6 +14,9 @@ from go1exp.config.schema.registry import effect
 from go1exp.robot import MOUNT, MOUNT_SLIDES
 from go1exp.robot.actuators import ActuatorSetup, ModelFields
 from go1exp.sim.effects.base import TWO_ATTITUDES, Effect, Identification, Measured, Param
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def _tilted(roll: Tensor, pitch: Tensor, v: Tensor) -> Tensor:
