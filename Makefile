@@ -70,7 +70,7 @@ PYTEST = $(BIN)/python -m pytest -n $(or $(JOBS),2) --dist loadscope -q
 
 # Files that need neither a training nor another process nor a search. Others: make quick T=tests/test_ppo.py
 T ?= $(addprefix tests/,contracts/test_actuators.py contracts/test_terms.py $(addprefix test_,$(addsuffix .py, \
-  configs delay_line excitations feet gap_score help layering logging randomness recording rewards selection)))
+  configs delay_line excitations feet help layering logging randomness recording rewards selection)))
 
 quick: setup ## run tests that take seconds, while working; of certain files: make quick T=tests/test_ppo.py
 	@echo "quick: pytest"
