@@ -533,3 +533,48 @@ def test_a_run_folder_has_a_copy_of_its_net_even_of_one_that_a_delay_wraps(make_
         assert file.read_bytes() == net.read_bytes()
         run_folder.write(run, run_folder.read_config(run))  # as a run that goes on does
         assert file.read_bytes() == net.read_bytes()
+
+
+def overshoot(drive: Callable[[float, float, float], float], dt: float) -> float:
+    """Of a joint of 0.03 kg m2 on a step of 0.2 rad from rest, as a share of the step; ``drive(target, q, qd)``."""
+    q = qd = highest = 0.0
+    drive(0.0, q, qd)
+    for _ in range(round(0.5 / dt)):
+        tau = drive(0.2, q, qd)
+        for _ in range(10):
+            qd += tau / 0.03 * dt / 10
+            q += qd * dt / 10
+        highest = max(highest, q)
+    return highest / 0.2 - 1.0
+
+
+def test_counting_samples_hides_most_of_the_overshoot_of_the_recorded_drive(
+    tmp_path: Path, make_net: Callable[..., Path], drives: Drives
+) -> None:
+    like, dt = load(make_net()), 0.005
+
+    def net(spacing: float, period: str) -> float:
+        path = firmware_at_20ms(tmp_path / "net.npz", like, spacing)
+        made = Net(drives(1, physics_dt=dt), file=str(path), period=period)  # type: ignore[arg-type]
+        return overshoot(lambda *inputs: made.torque(*map(rows, inputs))[0, 0].item(), dt)
+
+    def law(lag: int) -> float:
+        errors: list[float] = []
+
+        def drive(target: float, q: float, qd: float) -> float:
+            errors.append(target - q)
+            return float(np.clip(20.0 * errors[max(0, len(errors) - 1 - lag)] - 0.5 * qd, -23.7, 23.7))
+
+        return overshoot(drive, dt)
+
+    assert net(0.02, "resample") == pytest.approx(law(4), abs=1e-4)
+    assert net(0.005, "exact") == pytest.approx(law(1), abs=1e-4)
+    assert net(0.02, "hold") > net(0.02, "resample") > 1.5 * net(0.005, "exact")
+
+
+def test_a_stronger_line_has_a_corner(drives: Drives) -> None:
+    drive = motor(drives(1), kp=1000.0, kd=0.0, stall=30.0, speed=30.0)
+    for speed, most in [(0.0, 23.7), (6.3, 23.7), (10.0, 20.0), (30.0, 0.0)]:  # corner at 30 (1 - 23.7 / 30)
+        tau = drive.torque(rows(9.0), rows(0.0), rows(speed))[0]
+        assert tau[:2].tolist() == pytest.approx([most, most])
+        assert tau[2] == pytest.approx(30.0 * (1.0 - speed / 30.0))  # the line lies below the calf's 35.55

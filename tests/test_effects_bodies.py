@@ -566,3 +566,15 @@ def test_free_play_between_upright_and_upside_down_is_the_gap() -> None:
     play = (loose - rigid) * rigid.sign()
     assert torch.allclose(play[:, THIGHS], torch.full_like(play[:, THIGHS], gap), rtol=0.05)
     assert torch.allclose(play[:, CALVES], torch.full_like(play[:, CALVES], gap), rtol=0.05)
+
+
+def test_a_shifted_calf_hangs_lower_by_the_torque_of_its_weight() -> None:
+    """Static: kp x (change of angle) = weight x shift x sin(pitch of the calf), thigh and calf alike."""
+    shift, kp = 0.02, 400.0
+    a, b = (settle(rig({"link_com": {"along": {"calf": s}}}, kp=kp, kd=4.0)) for s in (0.0, shift))
+    q = robot.NOMINAL_STANCE
+    mass = rig({}).backend.model.body("FR_calf").mass[0]
+    lever = shift * np.sin(q[THIGHS] + q[CALVES]) * np.cos(q[HIPS])
+    for joint in (THIGHS, CALVES):
+        assert np.allclose(kp * (b - a)[0, joint].numpy(), -mass * G * lever, atol=2e-3, rtol=0.05)
+    assert np.abs(lever).min() > 0.005

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from go1exp import robot
 from go1exp.config.schema.registry import Entry, members
 from go1exp.extend.testing.randomness import backend as nominal
-from go1exp.extend.testing.randomness import everyone, parts, start_states, stream
+from go1exp.extend.testing.randomness import everyone, model_fields, parts, start_states, stream, with_fields
 from go1exp.extend.testing.snapshots import ODD, mirrored, random_snapshot
 from go1exp.mdp.types import Snapshot, TermSetup
 
@@ -112,6 +112,35 @@ def test_tilt_ends_an_episode_past_its_angle_whichever_way_the_robot_leans() -> 
 
 
 # Randomisations of the model
+
+
+NOTHING: dict[str, list[dict[str, Any]]] = {
+    "foot_friction": [
+        {"range": (0.8, 0.8), "operation": "set"},
+        {"range": (1.0, 1.0), "operation": "scale"},
+        {"range": (0.0, 0.0), "operation": "add"},
+    ],
+    "foot_restitution": [{"range": (math.exp(-2.0), math.exp(-2.0))}],
+    "ground_stiffness": [{"range": (0.02, 0.02)}],
+    "center_of_mass": [{"range": (0.0, 0.0)}],
+    "link_mass": [{"range": (1.0, 1.0)}],
+}
+"""Parameters of model terms at which the robot stays the nominal one (its feet: friction 0.8, critically damped)."""
+
+
+@each("rand", kind="model")
+def test_a_model_term_with_a_range_of_one_nominal_value_changes_nothing(
+    entry: Entry,
+) -> None:
+    for parameters in NOTHING[entry.name]:
+        robots = nominal(3)
+        before = with_fields(robots, entry)
+        entry.target(robots, stream(3), everyone(3), **parameters)
+        for name, values in model_fields(robots).items():
+            # A value that is set is a float32 draw, or looked up; one that is scaled or shifted must not move at all.
+            rtol = {"foot_friction": 1e-7, "foot_restitution": 1e-4, "ground_stiffness": 1e-7}.get(entry.name, 0.0)
+            rtol = 0.0 if parameters.get("operation") in ("scale", "add") else rtol
+            np.testing.assert_allclose(values, before[name], rtol=rtol, atol=0, err_msg=f"{name} {parameters}")
 
 
 @each("rand", kind="model")
