@@ -46,7 +46,7 @@ READINGS = (
     Port("joint_torque", J, "N m", "joint", "torques reported by the motors"),
     Port("joint_target", J, "rad", "joint", "present position targets; the nominal stance at the start"),
     Port("command", 3, "m/s, m/s, rad/s", "trunk", "commanded velocity: x, y and yaw rate"),
-    Port("previous_action", J, "1", "joint", "mean of the output `action` over the last training period; 0 before it"),
+    Port("previous_action", J, "1", "joint", "mean of the output `action` over the last training period; 0 at first"),
     Port("walked", 1, "s", "-", "time since walking began: a gait clock is a function of it"),
 )
 """Inputs that the robot's computer can provide. A graph has those that its terms read, in this order."""

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from go1exp.base.errors import FAULTS
 from go1exp.robot.messages import LowCmd, LowState
 
 SDK_RANGE = {"hip": (-1.047, 1.047), "thigh": (-0.663, 2.966), "calf": (-2.721, -0.837)}
@@ -247,7 +246,7 @@ class Safety:
         return f"the motors' power is {power:.0f} W, the limit is {self.config.power:g} W"
 
 
-RULES = tuple(name for name in FAULTS if hasattr(Safety, name))
+RULES = ("operator_stop", "stale_state", "not_finite", "attitude", "tilt", "joint_range", "torque", "power")
 """Names of the rules, in the order of evaluation; the first rule with a message is the fault."""
 
 STATELESS = ("operator_stop", "not_finite")
