@@ -56,7 +56,7 @@ demo: setup ## train for five minutes, evaluate the policy, render a video, find
 	@echo "demo 1/4: go1exp train experiment=five_minutes (five minutes on two cores)"
 	@$(BIN)/go1exp train experiment=five_minutes hydra.run.dir=runs/demo
 	@echo "demo 2/4: go1exp eval, at a finer physics step than in training (a quarter of a minute)"
-	@$(BIN)/go1exp eval run=runs/demo 'grid.x=[0.5,-0.5]' 'grid.y=[0.3]' 'grid.yaw=[0.8]' duration_s=10 physics_dt=0.002 noise=true
+	@$(BIN)/go1exp eval run=runs/demo 'grid.x=[0.5,-0.5]' 'grid.y=[0.3]' 'grid.yaw=[0.8]' seconds=10 physics_dt=0.002 noise=true
 	@echo "demo 3/4: go1exp play (half a minute)"
 	@$(BIN)/go1exp play run=runs/demo viewer=clip physics_dt=0.002
 	@echo "demo 4/4: go1exp gap, on recordings of a robot with friction that the model does not have (a minute)"

@@ -126,7 +126,7 @@ def main(arguments: Sequence[str]) -> None:
             copy_origin(Path(given["first"]), to / FIRST)
     config, policy, about = load_run(to)
     about["file"] = str(Path(about["file"]).relative_to(data_root()))
-    usual = {"duration_s": 20.0, "settle_s": 2.0, "policy_dt": None, "seed": 1}
+    usual = {"seconds": 20.0, "settle_s": 2.0, "policy_dt": None, "seed": 1}
     off = dict.fromkeys(("noise", "randomize", "push", "train_ground"), False)
     commands = grid(GRID["x"], GRID["y"], GRID["yaw"], cross=False)
     for name, on in EVALUATIONS.items():

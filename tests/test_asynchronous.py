@@ -25,7 +25,7 @@ from go1exp.train.asynchronous import AsyncEvaluation
 from go1exp.train.early_stop import EarlyStop
 from tests.small_run import SMALL, train
 
-BRIEF = ("eval.x=[0.5]", "eval.y=[]", "eval.yaw=[]", "eval.episodes=2", "eval.duration_s=0.4", "eval.settle_s=0.2")
+BRIEF = ("eval.x=[0.5]", "eval.y=[]", "eval.yaw=[]", "eval.episodes=2", "eval.seconds=0.4", "eval.settle_s=0.2")
 
 
 def evaluating(run: Path, iteration: int = 0, *more: str) -> AsyncEvaluation:

@@ -68,7 +68,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("train ppo.iteratons=7", ("ppo.iteratons=7", "did you mean 'ppo.iterations'")),
         ("train reward.gait.weigth=-1", ("reward.gait.weigth=-1", "did you mean 'reward.gait.weight'")),
         ("train ~reward.gat", ("reward.gat", "did you mean 'reward.gait'")),
-        ("eval run=x duration=3", ("duration=3", "did you mean 'duration_s'")),
+        ("eval run=x second=3", ("second=3", "did you mean 'seconds'")),
         # a new one
         ("train +sead=3", ("sead: unknown key", "did you mean 'seed'", "3")),
         ("train +ppo.gama=3", ("ppo.gama: unknown key", "did you mean 'gamma'", "3")),
@@ -115,8 +115,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("train event.push.velocity=[-1,1e300]", ("event.push.velocity.1 = 1e+300: must be from -100 to 100",)),
         ("train rand.body_velocity.range=[-1e300,1]", ("rand.body_velocity.range.0 = -1e+300: must be from -100",)),
         ("eval run=x episodes=0", ("episodes = 0", "greater than or equal to 1")),
-        ("eval run=x settle_s=30", ("settle_s = 30.0", "duration_s = 20.0")),
-        ("report x evaluation.duration_s=1", ("report: evaluation.settle_s = 2.0: must be",)),
+        ("eval run=x settle_s=30", ("settle_s = 30.0", "seconds = 20.0")),
+        ("report x evaluation.seconds=1", ("report: evaluation.settle_s = 2.0: must be",)),
         ("bench suite=fast", ("suite = 'fast'", "'env', 'train'", "'deploy'")),
         # a misspelt choice
         ("train rand=tabel1", ("rand=tabel1", "did you mean 'table1'?")),
@@ -553,7 +553,7 @@ def test_a_sweep_writes_one_run_folder_for_each_job(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["sweep"]
 
 
-GRID = ("grid.x=[0.5]", "grid.y=[]", "grid.yaw=[]", "episodes=2", "duration_s=0.4", "settle_s=0.1")
+GRID = ("grid.x=[0.5]", "grid.y=[]", "grid.yaw=[]", "episodes=2", "seconds=0.4", "settle_s=0.1")
 
 
 def test_eval_prints_a_table_and_writes_the_same_as_json(run: Path, tmp_path: Path) -> None:
@@ -572,7 +572,7 @@ def test_eval_prints_a_table_and_writes_the_same_as_json(run: Path, tmp_path: Pa
         assert set(command["rmse"]) == set(command["mean"]) == {"x", "y", "yaw"}
         assert command["episodes"] == 2
     assert report["episodes"] == 4
-    assert report["settings"]["duration_s"] == 0.4
+    assert report["settings"]["seconds"] == 0.4
     header, *lines = done.stdout.splitlines()
     assert "command" in header
     assert "RMSE" in header

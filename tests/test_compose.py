@@ -102,8 +102,8 @@ def test_the_fast_parser_reads_every_file_as_omegaconf_does() -> None:
 @pytest.mark.parametrize(
     ("words", "runs", "compositions"),
     [
-        (["--multirun", "duration_s=1,2"], 2, None),
-        (["hydra.mode=MULTIRUN", "duration_s=1,2"], 2, None),
+        (["--multirun", "seconds=1,2"], 2, None),
+        (["hydra.mode=MULTIRUN", "seconds=1,2"], 2, None),
         (["hydra.run.dir=there"], 1, 1),
         (["hydra.mode=RUN"], 1, 2),
     ],

@@ -418,7 +418,7 @@ LATE = ("backend.threads=1", "effect=command_delay", "effect.command_delay.delay
 
 
 def test_it_walks_by_noisy_sensors_the_estimator_and_late_commands(make_task: Callable[..., TaskConfig]) -> None:
-    brief = dataclasses.replace(WALK, duration_s=2.0, settle_s=1.0)
+    brief = dataclasses.replace(WALK, seconds=2.0, settle_s=1.0)
     report = evaluate(make_task(*LATE), None, brief, controller=lambda: Mpc(settings()))
     (row,) = report["commands"]
     assert row["falls"] == 0

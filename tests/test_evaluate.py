@@ -35,7 +35,7 @@ MakeTask = Callable[..., TaskConfig]
 
 
 def settings(*commands: tuple[float, float, float], **changes: Any) -> EvalConfig:
-    plain = EvalConfig(commands or ((0.5, 0.0, 0.0),), episodes=2, duration_s=1.0, settle_s=0.2)
+    plain = EvalConfig(commands or ((0.5, 0.0, 0.0),), episodes=2, seconds=1.0, settle_s=0.2)
     return dataclasses.replace(plain, **changes)
 
 
@@ -72,7 +72,7 @@ def test_an_estimated_velocity_stands_in_the_place_of_the_true_one(task: TaskCon
             swing = 1.5 * math.sin(2 * math.pi * 1.5 * 0.02 * len(kept))
             return torch.tensor([0.0, swing, -swing] * 4).repeat(len(observation), 1)
 
-        evaluate(task, sway, settings(trunk_velocity=how, duration_s=2.0))
+        evaluate(task, sway, settings(trunk_velocity=how, seconds=2.0))
     exact, estimated = (torch.stack(kept) for kept in by_source.values())
     assert torch.equal(exact[:, :, 3:], estimated[:, :, 3:])
     assert not torch.equal(exact[:, :, :3], estimated[:, :, :3])
@@ -100,7 +100,7 @@ def by_hand(task: TaskConfig, policy: Policy, config: EvalConfig) -> list[dict[s
     fell = [False] * robots
     velocities: list[list[np.ndarray]] = [[] for _ in range(robots)]
     dt = core.task.sim.policy_dt
-    for step in range(round(config.duration_s / dt)):
+    for step in range(round(config.seconds / dt)):
         result = core.step(policy(observation))
         observation = result.observation
         for i in range(robots):
@@ -132,7 +132,7 @@ def by_hand(task: TaskConfig, policy: Policy, config: EvalConfig) -> list[dict[s
 @pytest.mark.parametrize("after", [0, 25], ids=["falls while settling", "falls later"])
 def test_the_statistics_are_those_of_a_count_by_hand(after: int, task: TaskConfig) -> None:
     """Three commands; of the second one robot falls, of the third both."""
-    config = settings((0.5, 0.0, 0.0), (0.0, -0.3, 1.0), (1.0, 0.0, 0.0), duration_s=1.2, settle_s=0.3)
+    config = settings((0.5, 0.0, 0.0), (0.0, -0.3, 1.0), (1.0, 0.0, 0.0), seconds=1.2, settle_s=0.3)
     falling = [2, 4, 5]
     report = evaluate(task, topple(falling, after), config)
     expected = by_hand(task, topple(falling, after), config)
@@ -161,7 +161,7 @@ def test_a_fall_ends_the_counting(task: TaskConfig) -> None:
         steps[0] += 1
         return throw(observation) if steps[0] <= 60 else stand(observation)
 
-    report = evaluate(task, policy, settings((0.0, 0.0, 0.0), duration_s=3.0, settle_s=1.5))
+    report = evaluate(task, policy, settings((0.0, 0.0, 0.0), seconds=3.0, settle_s=1.5))
     (row,) = report["commands"]
     assert row["falls"] == 2  # not more, however often it falls and is put back
     assert row["mean_time_s"] < 1.2
@@ -176,7 +176,7 @@ def test_leaving_the_map_ends_the_counting_and_is_no_fall(task: TaskConfig, monk
         return torch.tensor([steps[0] == 10, False])
 
     monkeypatch.setattr(StepTerms, "cut_short", cut_short)
-    (row,) = evaluate(task, stand, settings(duration_s=1.0))["commands"]
+    (row,) = evaluate(task, stand, settings(seconds=1.0))["commands"]
     assert row["falls"] == 0
     assert row["mean_time_s"] == pytest.approx((9 * 0.02 + 1.0) / 2, abs=1e-4)
 
@@ -189,7 +189,7 @@ def test_each_robot_gets_the_command_of_its_row_and_its_policy_sees_it(task: Tas
         inputs.append(observation.clone())
         return stand(observation)
 
-    evaluate(task, policy, settings(*commands, duration_s=0.1, settle_s=0.0))
+    evaluate(task, policy, settings(*commands, seconds=0.1, settle_s=0.0))
     start = 0
     for term in task.observation:
         if "command" in term.key:
@@ -202,10 +202,10 @@ def test_each_robot_gets_the_command_of_its_row_and_its_policy_sees_it(task: Tas
 
 def test_progress_is_told_in_steps(task: TaskConfig) -> None:
     progress: list[tuple[int, int]] = []
-    evaluate(task, stand, settings(duration_s=0.2, settle_s=0.0), lambda done, total: progress.append((done, total)))
+    evaluate(task, stand, settings(seconds=0.2, settle_s=0.0), lambda done, total: progress.append((done, total)))
     assert progress == [(k, 10) for k in range(1, 11)]
     progress.clear()
-    faster = settings(duration_s=0.2, settle_s=0.0, policy_dt=0.01)
+    faster = settings(seconds=0.2, settle_s=0.0, policy_dt=0.01)
     evaluate(task, stand, faster, lambda done, total: progress.append((done, total)))
     assert progress[-1] == (20, 20)
 
@@ -219,13 +219,13 @@ def test_at_another_rate_the_previous_action_is_the_mean_over_a_training_period(
             inputs.append(float(observation[0, where].mean()))  # noqa: B023
             return torch.full((len(observation), 12), 0.01 * len(inputs))  # noqa: B023
 
-        evaluate(task, policy, settings(duration_s=0.2, settle_s=0.0, policy_dt=policy_dt))
+        evaluate(task, policy, settings(seconds=0.2, settle_s=0.0, policy_dt=policy_dt))
         given = [0.0] * cycles + [0.01 * (k + 1) for k in range(len(inputs))]
         assert inputs == pytest.approx([sum(given[k : k + cycles]) / cycles for k in range(len(inputs))], abs=1e-6)
 
 
 def test_the_same_seed_gives_the_same_report_which_says_under_what_it_was_made(task: TaskConfig) -> None:
-    config = settings(randomize=True, push=True, noise=True, duration_s=0.4, settle_s=0.0, seed=7)
+    config = settings(randomize=True, push=True, noise=True, seconds=0.4, settle_s=0.0, seed=7)
     policy: Policy = lambda observation: 0.3 * observation[:, :12]  # noqa: E731
     one = evaluate(task, policy, config)
     assert evaluate(task, policy, config) == one
@@ -256,14 +256,14 @@ def test_nothing_of_the_training_but_the_robot_stays_unless_asked_for(make_task:
 
 def test_no_time_limit_falls_into_the_evaluation(make_task: MakeTask) -> None:
     task = make_task("backend.threads=1", "sim.episode_s=0.2")
-    report = evaluate(task, stand, settings(duration_s=0.6))
+    report = evaluate(task, stand, settings(seconds=0.6))
     assert report["commands"][0]["mean_time_s"] == pytest.approx(0.6, abs=1e-4)
 
 
 def test_an_episode_that_does_not_fit_into_memory_is_refused_by_its_key(task: TaskConfig) -> None:
     """Without measures nothing is kept, and the first step is made."""
-    long = settings(duration_s=1e9)
-    with pytest.raises(ConfigError, match=r"duration_s = 1e\+09: .* at least .* GB are free .* s at most would fit"):
+    long = settings(seconds=1e9)
+    with pytest.raises(ConfigError, match=r"seconds = 1e\+09: .* at least .* GB are free .* s at most would fit"):
         evaluate(task, stand, long, measures=every_measure())
 
     def interrupted(done: int, total: int) -> None:
@@ -304,7 +304,7 @@ REPORT: dict[str, Any] = {
     "rmse": {"x": 0.05, "y": 0.1234, "yaw": 1.0},
     "falls": 17,
     "episodes": 32,
-    "settings": {"noise": True, "randomize": False, "push": True, "train_ground": False, "duration_s": 20.0},
+    "settings": {"noise": True, "randomize": False, "push": True, "train_ground": False, "seconds": 20.0},
 }
 CELLS = [
     ("+0.50, +0.00, -1.00", "+0.46, -0.00, -0.90", "0.05, 0.12, 1.00", "1/16", "20.0"),
@@ -379,7 +379,7 @@ def test_a_folder_without_checkpoints_is_named(trained: tuple[Path, TrainConfig]
         load_policy(tmp_path, config.ppo)
 
 
-QUIET = EvalConfig(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), episodes=3, duration_s=1.0, settle_s=0.4)
+QUIET = EvalConfig(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), episodes=3, seconds=1.0, settle_s=0.4)
 
 
 def hop() -> Callable[[Tensor], Tensor]:
@@ -457,7 +457,7 @@ def test_positive_power_is_the_work_of_the_drives(task: TaskConfig) -> None:
 
 
 def test_a_standing_robot_bears_its_weight_and_has_no_gait(task: TaskConfig) -> None:
-    report = evaluate(task, stand, dataclasses.replace(QUIET, duration_s=2.0, settle_s=1.0), measures=every_measure())
+    report = evaluate(task, stand, dataclasses.replace(QUIET, seconds=2.0, settle_s=1.0), measures=every_measure())
     standing, sent = (row["measures"] for row in report["commands"])
     mass = 12.743
     assert sum(standing["foot_load"]["mean"]) == pytest.approx(mass * GRAVITY, rel=0.02)
@@ -481,7 +481,7 @@ def test_episodes_that_repeat_another_one_count_once(task: TaskConfig) -> None:
 
 
 def test_a_policy_that_sees_an_estimated_velocity_is_measured_too(task: TaskConfig) -> None:
-    config = dataclasses.replace(QUIET, trunk_velocity="estimated", duration_s=0.4, settle_s=0.2)
+    config = dataclasses.replace(QUIET, trunk_velocity="estimated", seconds=0.4, settle_s=0.2)
     report = evaluate(task, stand, config, measures=every_measure())
     assert report["commands"][0]["measures"]["trunk_height"]["n"] == 1
 

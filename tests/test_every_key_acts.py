@@ -161,7 +161,7 @@ SMALL: dict[str, dict[str, Any]] = {
     """),
     "eval": given("""
         grid.x=[0.5,1.0] grid.y=[0.5] grid.yaw=[1.0] grid.cross=false
-        episodes=2 duration_s=0.2 settle_s=0.1 noise=true randomize=true push=true train_ground=true
+        episodes=2 seconds=0.2 settle_s=0.1 noise=true randomize=true push=true train_ground=true
     """),
     "play": given("seconds=0.4 noise=true randomize=true push=true train_ground=true viewer=clip"),
     "record": given("excitation=[gait] seconds=0.2 physics_dt=0.002 episodes=2"),

@@ -24,7 +24,7 @@ BUDGET = {
     "train": [*SMALL, "ppo.iterations=1"],
     "record": ["seconds=0.5", "out=recordings"],
     "record import": [],
-    "eval": ["episodes=1", "duration_s=0.5", "settle_s=0.2", "grid.x=[0.5]", "grid.y=[]", "grid.yaw=[]"],
+    "eval": ["episodes=1", "seconds=0.5", "settle_s=0.2", "grid.x=[0.5]", "grid.y=[]", "grid.yaw=[]"],
 }
 
 

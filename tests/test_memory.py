@@ -95,12 +95,12 @@ def one(name: str, *overrides: str) -> Chosen:
 @pytest.mark.parametrize(
     ("name", "key", "value", "unit"),
     [
-        ("corners", "duration_s", "{}", " s at most"),
-        ("energy", "duration_s", "{}", " s at most"),
-        ("gait", "duration_s", "{}", " s at most"),
-        ("hardware", "duration_s", "{}", " s at most"),
-        ("sinusoid", "duration_s", "{}", " s at most"),
-        ("rate", "duration_s", "{}", " s at most"),
+        ("corners", "seconds", "{}", " s at most"),
+        ("energy", "seconds", "{}", " s at most"),
+        ("gait", "seconds", "{}", " s at most"),
+        ("hardware", "seconds", "{}", " s at most"),
+        ("sinusoid", "seconds", "{}", " s at most"),
+        ("rate", "seconds", "{}", " s at most"),
         ("kicks", "first_s", "{}", " s at most"),
         ("kicks", "every_s", "{}", " s at most"),
         ("kicks", "jitter_s", "{}", " s at most"),
@@ -189,7 +189,7 @@ def test_a_step_takes_what_a_plan_and_its_motion_are_made_of(stage: Stage) -> No
 @pytest.mark.parametrize(
     ("name", "key"),
     [
-        *((name, "duration_s") for name in ("corners", "energy", "gait", "hardware", "sinusoid", "rate")),
+        *((name, "seconds") for name in ("corners", "energy", "gait", "hardware", "sinusoid", "rate")),
         *(("kicks", key) for key in ("first_s", "every_s", "push_s")),
         *(("push_map", key) for key in ("settle_s", "watch_s", "push_s")),
         ("terrain", "slack"),
@@ -208,16 +208,16 @@ def test_a_report_asks_no_run_for_what_does_not_fit(
     """It is the call's settings that are wrong, so that it ends; what is wrong with a run is a remark."""
 
     def too_long(*anything: Any) -> None:
-        raise TooLongError(["duration_s = 1e+09: too much"])
+        raise TooLongError(["seconds = 1e+09: too much"])
 
     monkeypatch.setattr(evaluating, "evaluate_run", too_long)
     monkeypatch.setattr(evaluating, "play_protocol", too_long)
     run: Any = types.SimpleNamespace(folder=Path("run"), label="run")
     show = lambda number, count, label: lambda done, total: None  # noqa: E731
     settings: Any = None
-    with pytest.raises(TooLongError, match=r"^evaluation\.duration_s = "):
+    with pytest.raises(TooLongError, match=r"^evaluation\.seconds = "):
         evaluating.evaluate_missing([evaluating.Wanted(run, None)], settings, show)
-    with pytest.raises(TooLongError, match=r"^duration_s = "):
+    with pytest.raises(TooLongError, match=r"^seconds = "):
         evaluating.evaluate_missing([evaluating.Wanted(run, one("gait"))], settings, show)
 
 
@@ -227,14 +227,14 @@ def test_a_report_asks_no_run_for_what_does_not_fit(
 @pytest.mark.parametrize(
     ("name", "overrides"),
     [
-        ("gait", ("duration_s=0.001", "settle_s=0.0")),
-        ("energy", ("duration_s=0.4", "settle_s=0.399")),
-        ("hardware", ("duration_s=0.4", "settle_s=0.399")),
-        ("rate", ("duration_s=0.02", "settle_s=0.019")),
+        ("gait", ("seconds=0.001", "settle_s=0.0")),
+        ("energy", ("seconds=0.4", "settle_s=0.399")),
+        ("hardware", ("seconds=0.4", "settle_s=0.399")),
+        ("rate", ("seconds=0.02", "settle_s=0.019")),
     ],
 )
 def test_a_protocol_without_a_step_that_counts_is_refused(name: str, overrides: tuple[str, ...], stage: Stage) -> None:
-    words = rf"^protocol\.{name}\.duration_s = 0\.\d+: of these 0\.\d+ s no step of the policy \(0\.0\d s\) is left"
+    words = rf"^protocol\.{name}\.seconds = 0\.\d+: of these 0\.\d+ s no step of the policy \(0\.0\d s\) is left"
     with pytest.raises(ConfigError, match=words):
         refuse(one(name, *overrides), stage)
 
@@ -254,8 +254,8 @@ def test_a_length_beyond_all_numbers_is_refused_too(stage: Stage) -> None:
 @pytest.mark.parametrize(
     ("verb", "overrides", "words"),
     [
-        ("eval", ("policy=clock", "duration_s=1e308"), "duration_s = 1e+308: input should be less than or equal to"),
-        ("eval", ("policy=clock", "duration_s=0.4", "settle_s=0.399"), "duration_s = 0.4: no step of the policy (0.02"),
+        ("eval", ("policy=clock", "seconds=1e308"), "seconds = 1e+308: input should be less than or equal to"),
+        ("eval", ("policy=clock", "seconds=0.4", "settle_s=0.399"), "seconds = 0.4: no step of the policy (0.02"),
         ("play", ("policy=clock", "viewer=clip", "seconds=1e308"), "seconds = 1e+308: input should be less than or eq"),
         ("play", ("policy=clock", "viewer=clip", "seconds=0.001"), "seconds = 0.001: shorter than a picture at fps ="),
         ("record", ("seconds=0.0001",), "seconds = 0.0001: shorter than a sample of the motion at"),

@@ -397,7 +397,7 @@ def test_a_run_is_read_with_its_copy_even_where_another_file_has_that_name(
 def test_eval_export_and_the_simulated_robot_get_along_with_the_terms_of_a_run(
     trained: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    short = ["episodes=1", "duration_s=0.1", "settle_s=0.0", "out=eval.json"]
+    short = ["episodes=1", "seconds=0.1", "settle_s=0.0", "out=eval.json"]
     assert go1exp("eval", f"run={trained}", *short) == 0, capsys.readouterr().err
     assert go1exp("export", f"run={trained}", "seconds=0.1", "out=bundle.zip") == 0, capsys.readouterr().err
     plugins.begin([])

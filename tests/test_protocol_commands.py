@@ -27,7 +27,7 @@ from tests.small_run import trained
 from tests.test_cli import assert_refused
 
 QUICK = (
-    *("protocol=corners", "protocol.corners.robots=2", "protocol.corners.duration_s=0.3"),
+    *("protocol=corners", "protocol.corners.robots=2", "protocol.corners.seconds=0.3"),
     *("protocol.corners.settle_s=0.2", "protocol.corners.rest_s=0.1", "protocol.corners.claims={}"),
     "protocol.corners.commands=[[0.5,0.0,0.0]]",
 )

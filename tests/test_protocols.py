@@ -40,13 +40,13 @@ from go1exp.sim.task import TaskConfig
 from tests.test_every_key_acts import unread
 
 SMALL = {
-    "sinusoid": ("robots=2", "duration_s=0.8", "ladder=[{amplitude:[0.5,0.3,0.5],period:0.4}]", "claims={}"),
+    "sinusoid": ("robots=2", "seconds=0.8", "ladder=[{amplitude:[0.5,0.3,0.5],period:0.4}]", "claims={}"),
     "kicks": ("robots=2", "impulses=[3.0]", "first_s=2.0", "every_s=2.0", "jitter_s=0.1"),
-    "gait": ("robots=3", "duration_s=0.6", "settle_s=0.2", "commands=[[0.5,0.0,0.0],[1.0,0.0,0.0]]"),
-    "corners": ("robots=2", "duration_s=0.6", "settle_s=0.4", "rest_s=0.2", "commands=[[0.5,0.0,0.0]]"),
-    "energy": ("robots=2", "duration_s=0.6", "settle_s=0.2", "commands=[[0.5,0.0,0.0]]"),
-    "hardware": ("robots=2", "duration_s=0.4", "settle_s=0.2", "commands=[[0.5,0.0,0.0]]", "delays_ms=[20.0]"),
-    "rate": ("robots=2", "duration_s=0.3", "settle_s=0.1", "rates_hz=[50.0,100.0]", "delays_ms=[0.0]"),
+    "gait": ("robots=3", "seconds=0.6", "settle_s=0.2", "commands=[[0.5,0.0,0.0],[1.0,0.0,0.0]]"),
+    "corners": ("robots=2", "seconds=0.6", "settle_s=0.4", "rest_s=0.2", "commands=[[0.5,0.0,0.0]]"),
+    "energy": ("robots=2", "seconds=0.6", "settle_s=0.2", "commands=[[0.5,0.0,0.0]]"),
+    "hardware": ("robots=2", "seconds=0.4", "settle_s=0.2", "commands=[[0.5,0.0,0.0]]", "delays_ms=[20.0]"),
+    "rate": ("robots=2", "seconds=0.3", "settle_s=0.1", "rates_hz=[50.0,100.0]", "delays_ms=[0.0]"),
     "push_map": ("robots=1", "directions=3", "phases=1", "settle_s=1.0", "watch_s=0.5", "halvings=1"),
     "terrain": (
         *("robots=1", "speeds=[8.0]", "slack=1.0", "grounds={slope_up:[5.0,10.0],gravel:[0.01,0.02]}"),
@@ -308,7 +308,7 @@ def test_a_robot_comes_back_when_it_does(agent: PolicyAgent) -> None:
         ("kicks protocol.kicks.claims.first_kick.quantity=survivd", "did you mean 'survived'"),
         ("kicks protocol.kicks.robots=0", "protocol.kicks.robots = 0"),
         ("kicks +protocol.kicks.robot=4", "protocol.kicks.robot"),
-        ("sinusoid protocol.sinusoid.duration_s=5.0", "must be at least two periods"),
+        ("sinusoid protocol.sinusoid.seconds=5.0", "must be at least two periods"),
         ("rate protocol.rate.slower_faster=[50.0,75.0]", "rates_hz has no 75"),
         ("corners protocol.corners.settle_s=9.0", "settle_s = 9.0: must lie between"),
         ("terrain protocol.terrain.grounds.waves=[0.2,0.1]", "grounds.waves = [0.2, 0.1]: must rise"),

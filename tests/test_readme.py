@@ -33,7 +33,7 @@ PAGES = [page for page in PAGES if "reference" not in page.parts]
 TRAINING = small(iterations=1)
 BUDGETS: dict[str, tuple[str, ...]] = {
     "train": TRAINING,
-    "eval": ("grid.x=[0.5]", "grid.y=[]", "grid.yaw=[]", "episodes=1", "duration_s=0.4", "settle_s=0.1"),
+    "eval": ("grid.x=[0.5]", "grid.y=[]", "grid.yaw=[]", "episodes=1", "seconds=0.4", "settle_s=0.1"),
     "export": ("seconds=0.1",),
     "deploy": ("seconds=1.0", "stand_up=0.5", "brake=0.2", "stale=5"),
     # A robot with friction that the model does not have, so that there is something to identify.

@@ -508,7 +508,7 @@ def test_the_page_needs_nothing_beside_it(two_groups: Path) -> None:
 def test_eval_true_evaluates_what_is_missing_with_the_runs_own_policy(tmp_path: Path) -> None:
     trained(tmp_path / "r", "ppo.iterations=1")
     run_state.write(tmp_path / "r", "done")
-    brief = {"x": [0.5], "y": [], "yaw": [], "episodes": 3, "duration_s": 0.2, "settle_s": 0.1}
+    brief = {"x": [0.5], "y": [], "yaw": [], "episodes": 3, "seconds": 0.2, "settle_s": 0.1}
     changes = [f"evaluation.{key}={value}" for key, value in brief.items()]
     short = ["robots=2", "first_s=2.0", "every_s=2.0", "jitter_s=0.1", "recovery.hold_s=0.1", "recovery.smooth_s=0.1"]
     changes += ["protocol=[grid,kicks]", *(f"protocol.kicks.{words}" for words in short)]

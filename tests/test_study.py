@@ -26,7 +26,7 @@ LAUNCHERS = {
 SMALLER = ("ppo.num_envs=32", "ppo.iterations=60", "checkpoint.every=2", "torch_threads=1")
 """What makes the study small; its recipe stays."""
 
-BRIEF = ("x=[0.5]", "y=[]", "yaw=[]", "episodes=2", "duration_s=1.0", "settle_s=0.5")
+BRIEF = ("x=[0.5]", "y=[]", "yaw=[]", "episodes=2", "seconds=1.0", "settle_s=0.5")
 
 
 @pytest.fixture

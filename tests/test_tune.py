@@ -346,7 +346,7 @@ def test_a_trial_that_evaluation_shows_to_be_bad_ends_early(tmp_path: Path) -> N
     from optuna.distributions import FloatDistribution
 
     changes: dict[str, Any] = {"metric": "eval/score", "direction": "minimize", "out": str(tmp_path / "search")}
-    brief = ("eval.x=[0.5]", "eval.y=[]", "eval.yaw=[]", "eval.episodes=2", "eval.duration_s=0.4", "eval.settle_s=0.2")
+    brief = ("eval.x=[0.5]", "eval.y=[]", "eval.yaw=[]", "eval.episodes=2", "eval.seconds=0.4", "eval.settle_s=0.2")
     overrides = words("ppo.iterations=1000000", "eval.every=2", *brief)
     space = {"ppo.gamma": Range(low=0.9, high=0.999)}
     (tmp_path / "search").mkdir()

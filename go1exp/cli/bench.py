@@ -80,7 +80,9 @@ def _task(container: dict[str, Any]) -> None:
     from go1exp.sim.task import parse_train
 
     on_gpu = settings.suite == "gpu"
-    overrides = ["backend=warp" if on_gpu else f"backend.threads={settings.threads}", *settings.overrides]
+    engine = "backend=warp" if on_gpu else f"backend.threads={settings.threads}"
+    # the step of evaluations on both engines, so that ratios are of the same physics
+    overrides = [engine, "sim.physics_dt=0.002", *settings.overrides]
     container = compose("train", overrides)
     config = parse_train(container)
 

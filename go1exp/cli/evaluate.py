@@ -55,7 +55,7 @@ class EvalSettings:
         checkpoint: file of the run; null takes the newest.
         grid: commanded velocities.
         episodes: episodes of each command, all at once.
-        duration_s: length of an episode, s.
+        seconds: length of an episode, s.
         settle_s: time at the start of an episode that does not count for tracking, s.
         noise: add the observation noise of training.
         randomize: randomise robots and starts as in training; false takes the nominal robot.
@@ -80,7 +80,7 @@ class EvalSettings:
     checkpoint: str | None
     grid: Grid
     episodes: Count
-    duration_s: Duration
+    seconds: Duration
     settle_s: NonNegative
     noise: bool
     randomize: bool
@@ -97,14 +97,14 @@ class EvalSettings:
 
     def __post_init__(self) -> None:
         """Check what concerns two settings."""
-        if self.settle_s >= self.duration_s:
-            raise ValueError(f"settle_s = {self.settle_s}: must be shorter than duration_s = {self.duration_s}")
+        if self.settle_s >= self.seconds:
+            raise ValueError(f"settle_s = {self.settle_s}: must be shorter than seconds = {self.seconds}")
 
 
 RATES = "rate"  # kind of protocol that only policies can play
 
 GRID_ONLY = (
-    *("grid", "episodes", "duration_s", "settle_s", "noise", "randomize", "push", "train_ground", "trunk_velocity"),
+    *("grid", "episodes", "seconds", "settle_s", "noise", "randomize", "push", "train_ground", "trunk_velocity"),
     *("measures", "delay_margin", "out"),
 )
 """Keys of ``go1exp eval`` that are the grid's."""

@@ -58,7 +58,7 @@ def _task(container: dict[str, Any]) -> None:
     from go1exp.sim.env.core import Go1Core
 
     drives = agent(subject, other)
-    whole = {"episodes": 1, "duration_s": settings.seconds, "settle_s": 0.0, "policy_dt": None}
+    whole = {"episodes": 1, "seconds": settings.seconds, "settle_s": 0.0, "policy_dt": None}
     shown = subset(EvalConfig, settings, commands=(settings.velocity,), engine=engine, **whole)
     shown_task = evaluation_task(drives.task, shown)
     if ground is not None:

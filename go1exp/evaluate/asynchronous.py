@@ -25,11 +25,11 @@ FALLEN = 1.0  # least error of a fallen robot, m/s
 NICE = 19  # lowest priority: the training comes first
 
 
-def score(rows: Sequence[dict[str, Any]], duration_s: float) -> float:
+def score(rows: Sequence[dict[str, Any]], seconds: float) -> float:
     """Return the root mean square horizontal error, m/s; of a fallen robot its command, and at least 1 m/s."""
     squares = []
     for row in rows:
-        share = min(row["moving_s"] / duration_s, 1.0)
+        share = min(row["moving_s"] / seconds, 1.0)
         lost = max(math.hypot(row["x"], row["y"]), FALLEN)
         squares.append(share * (row["error_xy"] or 0.0) ** 2 + (1.0 - share) * lost**2)
     return math.sqrt(sum(squares) / len(squares))
@@ -39,7 +39,7 @@ def evaluated(run: Path, policy_file: Path, settings: dict[str, Any]) -> dict[st
     """Return the figures of a policy file of a run: score, errors, share of falls."""
     config, policy, _ = load_run(run, policy_file)
     commands = grid(settings["x"], settings["y"], settings["yaw"], False)
-    names = ("episodes", "duration_s", "settle_s", "noise", "randomize", "seed")
+    names = ("episodes", "seconds", "settle_s", "noise", "randomize", "seed")
     engine = CpuBackend(name="cpu", threads=1)
     wanted = EvalConfig(commands, engine=engine, **{name: settings[name] for name in names})
     rows = evaluate(config.task, policy, wanted)["rows"]
@@ -49,7 +49,7 @@ def evaluated(run: Path, policy_file: Path, settings: dict[str, Any]) -> dict[st
         return sum(known) / len(known) if known else math.nan
 
     figures = {name: mean(name) for name in ("error_xy", "error_yaw")}
-    return {"score": score(rows, wanted.duration_s), **figures, "fall_share": mean("fell")}
+    return {"score": score(rows, wanted.seconds), **figures, "fall_share": mean("fell")}
 
 
 def record(run: Path, policy_file: Path, settings: dict[str, Any], out: Path) -> None:

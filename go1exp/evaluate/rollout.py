@@ -40,7 +40,7 @@ class EvalConfig:
 
     commands: tuple[Command, ...]  # the grid
     episodes: int  # episodes of each command
-    duration_s: float  # length of an episode, s
+    seconds: float  # length of an episode, s
     settle_s: float = 0.0  # time at its start that counts for falls but not for tracking, s
     noise: bool = False  # add the observation noise of training
     randomize: bool = False  # randomise robots and starts as in training; if not, the nominal robot
@@ -62,7 +62,7 @@ class EvalConfig:
 def evaluation_task(task: TaskConfig, config: EvalConfig) -> TaskConfig:
     """Return the task that evaluates a policy of ``task``, on the CPU; raise ConfigError if its two steps misfit."""
     period = config.policy_dt or task.sim.policy_dt
-    beyond = (math.ceil(config.duration_s / period) + 1) * period  # no time limit within the evaluation
+    beyond = (math.ceil(config.seconds / period) + 1) * period  # no time limit within the evaluation
     step = config.physics_dt or task.sim.physics_dt
     sim = dataclasses.replace(task.sim, physics_dt=step, policy_dt=period, episode_s=beyond, spread_starts=False)
     if problems := time_rules(sim):
@@ -154,20 +154,20 @@ def evaluate(
 
 def _steps(config: EvalConfig, dt: float) -> tuple[int, int]:
     """Return how many steps are played, and how many of them do not count; raise ConfigError if none does."""
-    steps, settle = round(config.duration_s / dt), round(config.settle_s / dt)
+    steps, settle = round(config.seconds / dt), round(config.settle_s / dt)
     if steps <= settle:
         left = f"no step of the policy ({dt:g} s) is left after settle_s = {config.settle_s:g}"
-        raise ConfigError([f"duration_s = {config.duration_s:g}: {left}"])
+        raise ConfigError([f"seconds = {config.seconds:g}: {left}"])
     return steps, settle
 
 
 def _refuse_too_long(config: EvalConfig, rate: float, count: int) -> None:
     """Raise TooLongError if ``rate`` B/s of what measures need of ``count`` robots do not fit into memory."""
-    seconds, available = config.duration_s - config.settle_s, memory.free()
+    seconds, available = config.seconds - config.settle_s, memory.free()
     if available is None or seconds * rate <= available:
         return
     what = f"what measures need of {counted(count, 'robot')} {memory.too_much(seconds * rate, available)}"
-    fitting, key = f"{available / rate:.0f} s", f"duration_s = {config.duration_s:g}"
+    fitting, key = f"{available / rate:.0f} s", f"seconds = {config.seconds:g}"
     if rate > available:  # not one second would fit
         fitting = str(int(config.episodes * available / (seconds * rate)))
         key = f"episodes = {config.episodes}"

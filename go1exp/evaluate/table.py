@@ -113,7 +113,7 @@ def _summary(report: dict[str, Any]) -> str:
     who = f"controller {other['name']}" if other else f"policy after {policy['num_timesteps'] / 1e6:.2f} M steps"
     return (
         f"{who}; RMSE over all: {rmse}; "
-        f"falls {report['falls']} in {report['episodes']} episodes of {settings['duration_s']:g} s; "
+        f"falls {report['falls']} in {report['episodes']} episodes of {settings['seconds']:g} s; "
         f"with {', '.join(on) if on else 'no noise, randomisation or pushes, on flat ground'}"
         + (f"; moved by {settings['engine']['name']}" if report.get("agreement") else "")
     )

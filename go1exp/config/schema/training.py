@@ -141,7 +141,7 @@ class EvalDuring(Strict):
         y: velocities to the left, m/s.
         yaw: yaw rates, rad/s.
         episodes: robots of each command.
-        duration_s: length of an episode, s.
+        seconds: length of an episode, s.
         settle_s: time at its start that does not count for tracking, s.
         noise: add the observation noise of training.
         randomize: randomise robots and starts as in training.
@@ -153,7 +153,7 @@ class EvalDuring(Strict):
     y: tuple[float, ...] = (0.5,)
     yaw: tuple[float, ...] = (1.0,)
     episodes: Count = 8
-    duration_s: Positive = 8.0
+    seconds: Positive = 8.0
     settle_s: NonNegative = 2.0
     noise: bool = True
     randomize: bool = True

@@ -74,5 +74,5 @@ def _evaluate(folder: Path, rng: np.random.Generator, level: float) -> None:
     fell = rng.random(len(commands)) < 0.2 * (1.1 - friction)
     moving = np.where(fell, 5.0, 10.0)
     rows = rows_of(commands, EPISODES, errors, fell, moving, {"foot_friction_mean": friction}, {})
-    settings = {"episodes": EPISODES, "duration_s": 10.0, "noise": True, "randomize": True, "seed": 1}
+    settings = {"episodes": EPISODES, "seconds": 10.0, "noise": True, "randomize": True, "seed": 1}
     write({"settings": settings, "robot": {}, "commands": [{"command": c} for c in GRID], "rows": rows}, folder / FILE)

@@ -104,7 +104,7 @@ class Stage:
         config = EvalConfig(
             commands=(),
             episodes=plan.robots,
-            duration_s=len(plan.command) * policy_dt,
+            seconds=len(plan.command) * policy_dt,
             noise=setting.noise,
             randomize=setting.randomize,
             policy_dt=policy_dt,

@@ -24,7 +24,7 @@ class EvaluationSettings:
         y: velocities to the left, m/s.
         yaw: yaw rates, rad/s.
         episodes: robots of each command.
-        duration_s: length of an episode, s.
+        seconds: length of an episode, s.
         settle_s: initial time excluded from tracking errors, s.
         noise: add the observation noise of training.
         randomize: randomise robots and starts as in training.
@@ -38,7 +38,7 @@ class EvaluationSettings:
     y: tuple[float, ...]
     yaw: tuple[float, ...]
     episodes: Count
-    duration_s: Duration
+    seconds: Duration
     settle_s: NonNegative
     noise: bool
     randomize: bool
@@ -48,8 +48,8 @@ class EvaluationSettings:
     checkpoint: Literal["newest", "best"]
 
     def __post_init__(self) -> None:
-        if self.settle_s >= self.duration_s:
-            raise ValueError(f"settle_s = {self.settle_s}: must be shorter than duration_s = {self.duration_s}")
+        if self.settle_s >= self.seconds:
+            raise ValueError(f"settle_s = {self.settle_s}: must be shorter than seconds = {self.seconds}")
 
 
 @settings

@@ -248,7 +248,7 @@ def task_under(task: TaskConfig, setup: Setup, known: Mapping[str, Ground], effe
     config = EvalConfig(
         commands=(),
         episodes=1,
-        duration_s=FOREVER,
+        seconds=FOREVER,
         noise=setup.noise,
         randomize=setup.randomize,
         push=setup.push,

@@ -170,14 +170,14 @@ class Hardware(Steady):
     def lengths(self) -> list[Length]:
         """Return the lengths of the commands without and with further delays."""
         late = self.robots * len(self.commands) * len(self.delays_ms)
-        return [*Steady.lengths(self), Length(self.duration_s, late, self.causes(), self.settle_s)]
+        return [*Steady.lengths(self), Length(self.seconds, late, self.causes(), self.settle_s)]
 
     def play(self, stage: Stage) -> Played:
         """Play the commands without further delays, and again with them, for falls alone."""
         played = Steady.play(self, stage)
         for row in played.rows:
             row["delay_ms"] = 0.0
-        t = stage.times(self.duration_s)
+        t = stage.times(self.seconds)
         each = len(self.commands) * self.robots
         velocities = np.repeat(np.array(self.commands), self.robots, axis=0)
         command = np.tile(velocities, (len(t), len(self.delays_ms), 1)) * (t >= self.rest_s - 1e-9)[:, None, None]

@@ -102,7 +102,7 @@ class Kicks(Protocol):
             raise ValueError(f"push_s = {self.push_s}: must be at most every_s = {self.every_s}")
 
     @property
-    def duration_s(self) -> float:
+    def seconds(self) -> float:
         """Length, s."""
         return self.first_s + len(self.impulses) * self.every_s + self.jitter_s
 
@@ -114,7 +114,7 @@ class Kicks(Protocol):
             Cause("every_s", every, LEAST, lambda seconds: (seconds - first - jitter) / count),
             Cause("jitter_s", jitter, 0.0, lambda seconds: seconds - first - count * every),
         ]
-        return [Length(self.duration_s, self.robots, causes, recorded=bool(self.terms()))]
+        return [Length(self.seconds, self.robots, causes, recorded=bool(self.terms()))]
 
     def starts(self) -> NDArray[np.float64]:
         """Return when each robot is kicked (N, P), s."""
@@ -123,7 +123,7 @@ class Kicks(Protocol):
 
     def play(self, stage: Stage) -> Played:
         """Kick all robots, odd ones from the other side."""
-        t = stage.times(self.duration_s)
+        t = stage.times(self.seconds)
         side = self._sides()
         count = len(self.impulses)
         sizes = np.tile(np.array(self.impulses), (self.robots, 1))

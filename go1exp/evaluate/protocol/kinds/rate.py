@@ -31,7 +31,7 @@ class Rate(Protocol):
 
     Attributes:
         command: commanded velocity.
-        duration_s: length, s.
+        seconds: length, s.
         settle_s: time at its start that counts for falls alone, s.
         rates_hz: of the policy; the physics step is the largest up to that of training that divides its period.
         delays_ms: further command delays, added to those of the robot.
@@ -40,7 +40,7 @@ class Rate(Protocol):
     """
 
     command: Signal
-    duration_s: Positive
+    seconds: Positive
     settle_s: NonNegative
     rates_hz: Annotated[tuple[Annotated[float, Field(ge=10, le=1000)], ...], Field(min_length=1)]
     delays_ms: Annotated[tuple[Annotated[float, Field(ge=0, le=LATEST_MS)], ...], Field(min_length=1)]
@@ -59,8 +59,8 @@ class Rate(Protocol):
     def __post_init__(self) -> None:
         wrong = repeated("rates_hz", self.rates_hz) + repeated("delays_ms", self.delays_ms)
         wrong += repeated("velocities", self.velocities)
-        if self.settle_s >= self.duration_s:
-            wrong.append(f"settle_s = {self.settle_s}: must be shorter than duration_s = {self.duration_s}")
+        if self.settle_s >= self.seconds:
+            wrong.append(f"settle_s = {self.settle_s}: must be shorter than seconds = {self.seconds}")
         if missing := [r for r in self.slower_faster if r not in self.rates_hz]:
             wrong.append(f"slower_faster = {list(self.slower_faster)}: rates_hz has no {missing[0]:g}")
         if wrong:
@@ -72,9 +72,9 @@ class Rate(Protocol):
 
     def lengths(self) -> list[Length]:
         """Return that of each velocity and rate, all delays as one batch."""
-        causes, robots = [Cause("duration_s", self.duration_s, least=self.settle_s)], len(self.delays_ms) * self.robots
+        causes, robots = [Cause("seconds", self.seconds, least=self.settle_s)], len(self.delays_ms) * self.robots
         return [
-            Length(self.duration_s, robots, causes, self.settle_s, True, 1.0 / rate)
+            Length(self.seconds, robots, causes, self.settle_s, True, 1.0 / rate)
             for _ in self.velocities
             for rate in self.rates_hz
         ]
@@ -85,7 +85,7 @@ class Rate(Protocol):
         delay = np.repeat(np.array(self.delays_ms) * 1e-3, self.robots)
         for velocity in self.velocities:
             for rate in self.rates_hz:
-                t = stage.times(self.duration_s, 1.0 / rate)
+                t = stage.times(self.seconds, 1.0 / rate)
                 command = np.repeat(self.command.at(t)[:, None], len(delay), 1)
                 settle = round(self.settle_s * rate)
                 plan = Plan(command, delay=delay, policy_dt=1.0 / rate, listen_from=settle, trunk_velocity=velocity)

@@ -42,19 +42,19 @@ class Sinusoid(Protocol):
     """Sines of all three velocities at once: gain and lag by projection, coherence, error (paper, Fig. 4 and 5).
 
     Attributes:
-        duration_s: length, s; the first period does not count.
+        seconds: length, s; the first period does not count.
         ladder: sines, one after the other harder.
     """
 
-    duration_s: Positive
+    seconds: Positive
     ladder: Annotated[tuple[Sine, ...], Field(min_length=1)]
 
     keys: ClassVar[tuple[str, ...]] = ("amplitude", "period")
     robot_columns: ClassVar[tuple[Column, ...]] = _columns()
 
     def __post_init__(self) -> None:
-        if self.duration_s < 2.0 * self.longest:
-            raise ValueError(f"duration_s = {self.duration_s}: must be at least two periods, {2 * self.longest:g}")
+        if self.seconds < 2.0 * self.longest:
+            raise ValueError(f"seconds = {self.seconds}: must be at least two periods, {2 * self.longest:g}")
         if wrong := repeated("ladder", [f"{label(sine)} at {sine.period:g} s" for sine in self.ladder]):
             raise ValueError(wrong[0])
 
@@ -65,12 +65,12 @@ class Sinusoid(Protocol):
 
     def lengths(self) -> list[Length]:
         """Return that of all sines as one batch."""
-        causes = [Cause("duration_s", self.duration_s, least=2.0 * self.longest)]
-        return [Length(self.duration_s, self.robots * len(self.ladder), causes, self.longest, bool(self.terms()))]
+        causes = [Cause("seconds", self.seconds, least=2.0 * self.longest)]
+        return [Length(self.seconds, self.robots * len(self.ladder), causes, self.longest, bool(self.terms()))]
 
     def play(self, stage: Stage) -> Played:
         """Play all sines as one batch: the robots of one are neighbours."""
-        t = stage.times(self.duration_s)
+        t = stage.times(self.seconds)
         command = np.concatenate([np.repeat(s.at(t)[:, None], self.robots, 1) for s in self.ladder], 1)
         listen = round(self.longest / stage.policy_dt) if self.terms() else None
         motion = stage.run(Plan(command, listen_from=listen))

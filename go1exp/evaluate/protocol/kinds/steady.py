@@ -35,21 +35,21 @@ class Steady(Protocol):
 
     Attributes:
         commands: each as x m/s, y m/s, yaw rad/s.
-        duration_s: length, s.
+        seconds: length, s.
         settle_s: time at its start that counts for falls alone, s.
         rest_s: time at its start, within ``settle_s``, with a zero command, s.
     """
 
     commands: Annotated[tuple[Velocity, ...], Field(min_length=1)]
-    duration_s: Positive
+    seconds: Positive
     settle_s: NonNegative
     rest_s: NonNegative
 
     keys: ClassVar[tuple[str, ...]] = AXES
 
     def __post_init__(self) -> None:
-        if not self.rest_s <= self.settle_s < self.duration_s:
-            order = f"rest_s = {self.rest_s} and duration_s = {self.duration_s}"
+        if not self.rest_s <= self.settle_s < self.seconds:
+            order = f"rest_s = {self.rest_s} and seconds = {self.seconds}"
             raise ValueError(f"settle_s = {self.settle_s}: must lie between {order}")
         if wrong := repeated("commands", self.commands):
             raise ValueError(wrong[0])
@@ -57,15 +57,15 @@ class Steady(Protocol):
     def lengths(self) -> list[Length]:
         """Return that of all commands as one batch."""
         robots, recorded = self.robots * len(self.commands), bool(self.terms())
-        return [Length(self.duration_s, robots, self.causes(), self.settle_s, recorded)]
+        return [Length(self.seconds, robots, self.causes(), self.settle_s, recorded)]
 
     def causes(self) -> list[Cause]:
         """Return what says how long a batch plays."""
-        return [Cause("duration_s", self.duration_s, least=self.settle_s)]
+        return [Cause("seconds", self.seconds, least=self.settle_s)]
 
     def play(self, stage: Stage) -> Played:
         """Play all commands as one batch."""
-        t = stage.times(self.duration_s)
+        t = stage.times(self.seconds)
         signals = [Constant(velocity=c, rest=self.rest_s).at(t) for c in self.commands]
         command = np.repeat(np.stack(signals, 1), self.robots, axis=1)
         settle = round(self.settle_s / stage.policy_dt)
