@@ -266,7 +266,7 @@ def test_an_effect_file_may_be_called_anything(given: str, tmp_path: Path) -> No
         ("reward.foot_slip.wieght=-1", "no such key 'reward.foot_slip.wieght'; did you mean 'reward.foot_slip.weight'"),
         ("+seed=3", "+seed=3: 'seed' exists already; leave out the plus: 'seed=3'"),
         ("+reward.gait.weight=3", "'reward.gait.weight' exists already; leave out the plus: 'reward.gait.weight=3'"),
-        ("terrain=hilly", "terrain=hilly: unknown choice of terrain 'hilly'; known: flat, rough"),
+        ("terrain=hilly", "terrain=hilly: unknown choice of terrain 'hilly'; known: flat, rough, steps"),
     ],
 )
 def test_the_environment_refuses_overrides_in_the_words_of_the_command_line(override: str, said: str) -> None:

@@ -20,8 +20,11 @@ EVEN: dict[str, Any] = {
     "bumps_proportion": 1.0,
     "ramps_proportion": 2.0,
     "flat_proportion": 1.0,
+    "stairs_proportion": 2.0,
+    "obstacles_proportion": 1.0,
+    "gaps_proportion": 1.0,
 }
-ONE_OF_EACH = replace(CONFIG, cols=5, **EVEN)
+ONE_OF_EACH = replace(CONFIG, cols=len(TILE_TYPES), **EVEN)
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +86,7 @@ def problems_of(change: dict) -> list[str]:
         ({"border": -1.0}, "terrain.border = -1.0: input should be greater than or equal to 0"),
         ({"platform": 7.8}, "terrain.platform = 7.8: must be at most 7.6 (two samples short of the tile border)"),
         ({"boxes_proportion": -0.1}, "terrain.boxes_proportion = -0.1: input should be greater than or equal to 0"),
-        (dict.fromkeys(EVEN, 0.0), "terrain.boxes_proportion = 0: must be > 0 when the other three proportions are 0"),
+        (dict.fromkeys(EVEN, 0.0), "terrain.boxes_proportion = 0: must be > 0 when the other proportions are 0"),
         ({"box_height": [0.1, 0.05]}, "terrain.box_height = [0.1, 0.05]: low must not exceed high"),
         ({"bump_amplitude": 0.05}, "terrain.bump_amplitude = 0.05: input should be a valid array"),
         ({"ramp_slope": [0.0, 0.1, 0.2]}, "terrain.ramp_slope = [0.0, 0.1, 0.2]: tuple should have at most 2 items"),
@@ -128,10 +131,11 @@ def test_columns_follow_the_proportions() -> None:
     assert column_types(ONE_OF_EACH) == TILE_TYPES
     rng = np.random.default_rng(0)
     for _ in range(20):
-        share: dict[str, Any] = dict(zip(EVEN, rng.dirichlet(np.ones(4)), strict=True))
+        share: dict[str, Any] = dict(zip(EVEN, rng.dirichlet(np.ones(len(EVEN))), strict=True))
         types = column_types(replace(CONFIG, cols=40, **share))
-        boxes, bumps, ramps, flat = share.values()
-        for name, expected in zip(TILE_TYPES, (boxes, bumps, ramps / 2, ramps / 2, flat), strict=True):
+        boxes, bumps, ramps, flat, stairs, obstacles, gaps = share.values()
+        all_shares = (boxes, bumps, ramps / 2, ramps / 2, flat, stairs / 2, stairs / 2, obstacles, gaps)
+        for name, expected in zip(TILE_TYPES, all_shares, strict=True):
             assert abs(types.count(name) - 40 * expected) <= 1.05
     only_boxes: dict[str, Any] = dict.fromkeys(EVEN, 0.0) | {"boxes_proportion": 2.0}
     assert set(column_types(replace(CONFIG, cols=3000, **only_boxes))) == {"boxes"}
@@ -146,11 +150,17 @@ def test_difficulty_grows_with_the_row_and_stays_within_bounds(name: str) -> Non
     if name == "flat":
         assert max(relief) == 0.0
         return
+    if name == "gaps":  # they grow wider, not deeper; of one sample there is none
+        assert relief[1] == 0.0 < relief[2] < relief[3]
+        assert [t.min() for t in tiles[2:]] == pytest.approx([-0.5, -0.5], abs=1e-6)
+        return
     assert all(np.diff(relief) > 0)
     run = 0.5 * (CONFIG.tile_size - CONFIG.platform)
-    top = {"boxes": 0.1, "bumps": 0.06, "ramp_up": 0.4 * run, "ramp_down": 0.4 * run}[name]
+    ramp, stairs = 0.4 * run, 0.2 * round(run / CONFIG.stair_tread)
+    top = {"boxes": 0.1, "bumps": 0.06, "obstacles": 0.2} | dict.fromkeys(("ramp_up", "ramp_down"), ramp)
+    top |= dict.fromkeys(("stairs_up", "stairs_down"), stairs)
     for row, heights in enumerate(tiles):
-        bound, rounding = top * row / 3, 1e-6
+        bound, rounding = top[name] * row / 3, 1e-6
         assert np.abs(heights).max() <= bound + rounding
         assert np.abs(heights).max() >= 0.9 * bound
 
@@ -167,6 +177,33 @@ def test_a_ramp_has_its_slope_on_all_four_sides(terrain: Terrain) -> None:
     middle = len(heights) // 2
     for line in (heights[middle], heights[middle, ::-1], heights[:, middle], heights[::-1, middle]):
         np.testing.assert_allclose(np.diff(line[:31]) / CONFIG.resolution, 0.4, atol=1e-5)
+
+
+def test_stairs_have_their_rise_and_tread_on_all_four_sides() -> None:
+    terrain = build_terrain(replace(ONE_OF_EACH, stair_rise=(0.05, 0.15)))
+    heights = tile(terrain, 3, TILE_TYPES.index("stairs_down"))
+    middle = len(heights) // 2
+    for line in (heights[middle], heights[middle, ::-1], heights[:, middle], heights[::-1, middle]):
+        risers = np.flatnonzero(np.diff(line[:41]))
+        np.testing.assert_allclose(np.diff(line)[risers], -0.15, atol=1e-6)
+        assert set(np.diff(risers)) == {3}  # 0.3 m at 0.1 m a sample
+        assert len(risers) == 10
+
+
+def test_gaps_are_as_wide_as_they_should_be_and_a_metre_apart() -> None:
+    terrain = build_terrain(replace(ONE_OF_EACH, gap_width=(0.2, 0.5)))
+    for row, width in enumerate((2, 3, 4, 5)):  # samples from edge to edge
+        heights = tile(terrain, row, TILE_TYPES.index("gaps"))
+        line = heights[len(heights) // 2, len(heights) // 2 :]  # from the centre outward
+        edges = np.flatnonzero(np.diff((line < 0).astype(int)))
+        assert edges[1] + 1 - edges[0] == width
+        assert edges[2] - edges[0] == 10
+
+
+def test_obstacles_stand_alone_on_flat_ground() -> None:
+    heights = tile(build_terrain(ONE_OF_EACH), 3, TILE_TYPES.index("obstacles"))
+    assert 0.05 < (heights > 0).mean() < 0.4
+    assert heights[heights > 0].min() >= 0.1 - 1e-6  # half of the highest
 
 
 def test_boxes_are_flat_squares_of_the_cell_size(terrain: Terrain) -> None:

@@ -46,7 +46,7 @@ def _resumed(run: Path, overrides: list[str]) -> dict[str, Any]:
         if key == "resume" or key.lstrip("+").startswith("hydra"):
             continue
         if key == "backend":
-            container["backend"] = read_yaml(config_folder() / "backend" / f"{value}.yaml")["backend"]
+            container["backend"] = read_yaml(config_folder() / "backend" / f"{value}.yaml")
         elif _may_change(key):
             container = with_values(container, [f"{key}={value}"])
         else:

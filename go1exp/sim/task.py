@@ -53,12 +53,14 @@ class SimConfig(Strict):
         policy_dt: period of the policy, s.
         episode_s: length of an episode, s.
         spread_starts: first episodes begin at random times, so that not all end together.
+        step_on: physics step of each backend, of which physics_dt takes one, s.
     """
 
     physics_dt: Annotated[float, Field(gt=0, le=0.02)]
     policy_dt: Annotated[float, Field(gt=0, le=0.1)]
     episode_s: Positive
     spread_starts: bool
+    step_on: dict[str, Positive] = field(default_factory=dict, compare=False)
 
     @property
     def decimation(self) -> int:

@@ -1,11 +1,11 @@
-"""Ground to walk on: a flat plane, or a height field of graded tiles (boxes, bumps, ramps) for a curriculum.
+"""Ground to walk on: a flat plane, or a height field of graded tiles (boxes, ramps, stairs and so on) for a curriculum.
 
 World frame, z up, the field centred on the world origin. Rows are difficulty levels and follow +x; columns are kinds of
 ground and follow +y, as in legged_gym. A tile is at height 0 along its whole border, so tiles meet without a step.
 
 The kinds follow the paper ("boxes with slight variations in height close to 0 on the z-axis", "bumpy patches by adding
-noise to terrain heights", ramps in its figure); tile grid, column rule and interpolation follow legged_gym, sizes the
-Go1 rough task of Isaac Lab. Nothing here knows the simulator: `sim/physics/scene.py` hands the field to MuJoCo,
+noise to terrain heights", ramps in its figure), and what other laboratories climb: stairs, obstacles, gaps. Tile grid,
+column rule and interpolation follow legged_gym, sizes the Go1 rough task of Isaac Lab. Nothing here knows the simulator: `sim/physics/scene.py` hands the field to MuJoCo,
 `mdp/ground.py` has the law of heights between samples.
 """
 
@@ -22,8 +22,14 @@ from pydantic import AfterValidator
 from go1exp.config.schema.registry import Count, CountOrZero, NonNegative, Positive, Strict, ordered
 from go1exp.mdp.ground import GroundHeight
 
-TILE_TYPES = ("boxes", "bumps", "ramp_up", "ramp_down", "flat")
+TILE_TYPES = ("boxes", "bumps", "ramp_up", "ramp_down", "flat", "stairs_up", "stairs_down", "obstacles", "gaps")
 """Kinds of tile, in the order in which columns take them."""
+
+OBSTACLES, OBSTACLE_EDGE = 0.4, (0.4, 1.0)
+"""Density of obstacles before the platform is cleared, 1/m2, and their shortest and longest edge, m."""
+
+GAP_DEPTH, GAP_SPACING = 0.5, 1.0
+"""Depth of a gap and distance between two of them, m."""
 
 FloatArray = NDArray[np.float64]
 
@@ -49,10 +55,13 @@ class TerrainConfig(Strict):
             Go1 trotting on the top rows: 22 to 27 us a step at 0.1, 28 to 32 us at 0.05; 12 us on a plane).
         platform: Edge of the flat square in the middle of a tile where robots spawn, m.
         seed: Seed of the random heights, >= 0.
-        boxes_proportion: Share of columns with boxes. The four shares are relative: they need not add up to 1.
+        boxes_proportion: Share of columns with boxes. The shares are relative: they need not add up to 1.
         bumps_proportion: Share of columns with bumps.
         ramps_proportion: Share of columns with ramps, half of them up to the platform, half down to it.
         flat_proportion: Share of columns without relief.
+        stairs_proportion: Share of columns with stairs, half of them up to the platform, half down to it.
+        obstacles_proportion: Share of columns with single blocks on flat ground.
+        gaps_proportion: Share of columns with square rings of gaps round the platform.
         box_height: Largest height of a box above or below 0, m; heights are uniform in between (Isaac Lab, Go1: 0.1).
         box_cell: Edge of a square box, m (Isaac Lab: 0.45). Edges fall on the nearest sample and a riser is inclined
             over one sample, since a height field has no vertical walls.
@@ -61,6 +70,11 @@ class TerrainConfig(Strict):
         bump_length: Distance over which the autocorrelation of the bumps, exp(-(r / length)^2), falls to 1/e, m.
         bump_blend: Width over which bumps fade in from the tile border and from the platform, m.
         ramp_slope: Rise over run of the four sides of the ramp pyramid (legged_gym, Isaac Lab: 0.4).
+        stair_rise: Height of a step, m (legged_gym: 0.05 to 0.23).
+        stair_tread: Depth of a step, m, best a whole number of samples (legged_gym: 0.31). A riser is inclined over one
+            sample.
+        obstacle_height: Largest height of a block, m; heights are uniform from half of it (legged_gym: 0.05 to 0.25).
+        gap_width: Width of a gap at its top, m, rounded to samples; below two samples there is none.
 
     Raises:
         ValueError: If fields do not fit together; the message names every such field and what it may be.
@@ -78,12 +92,19 @@ class TerrainConfig(Strict):
     bumps_proportion: NonNegative = 0.3
     ramps_proportion: NonNegative = 0.3
     flat_proportion: NonNegative = 0.1
+    stairs_proportion: NonNegative = 0.0
+    obstacles_proportion: NonNegative = 0.0
+    gaps_proportion: NonNegative = 0.0
     box_height: NonNegativeRange = (0.0, 0.1)
     box_cell: Positive = 0.45
     bump_amplitude: NonNegativeRange = (0.0, 0.06)
     bump_length: Positive = 0.25
     bump_blend: NonNegative = 0.5
     ramp_slope: NonNegativeRange = (0.0, 0.4)
+    stair_rise: NonNegativeRange = (0.0, 0.2)
+    stair_tread: Positive = 0.3
+    obstacle_height: NonNegativeRange = (0.0, 0.2)
+    gap_width: NonNegativeRange = (0.0, 0.4)
 
     def __post_init__(self) -> None:
         """Check what concerns several fields."""
@@ -96,15 +117,17 @@ class TerrainConfig(Strict):
         if self.platform > widest:
             rule = f"must be at most {widest:g} (two samples short of the tile border)"
             problems.append(f"platform = {self.platform}: {rule}")
-        if not any(self.proportions):
-            problems.append("boxes_proportion = 0: must be > 0 when the other three proportions are 0 too")
+        if not any(self.shares):
+            problems.append("boxes_proportion = 0: must be > 0 when the other proportions are 0 too")
         if problems:
             raise ValueError("\n".join(problems))
 
     @property
-    def proportions(self) -> tuple[float, float, float, float]:
-        """Shares of columns with boxes, bumps, ramps and without relief."""
-        return self.boxes_proportion, self.bumps_proportion, self.ramps_proportion, self.flat_proportion
+    def shares(self) -> tuple[float, ...]:
+        """Relative share of columns of each of `TILE_TYPES`."""
+        ramps, stairs = 0.5 * self.ramps_proportion, 0.5 * self.stairs_proportion
+        first = (self.boxes_proportion, self.bumps_proportion, ramps, ramps, self.flat_proportion)
+        return (*first, stairs, stairs, self.obstacles_proportion, self.gaps_proportion)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -202,8 +225,7 @@ def _build(config: TerrainConfig) -> Terrain:
 
 def column_types(config: TerrainConfig) -> tuple[str, ...]:
     """Deal tile types to columns, (cols,): the first whose cumulative share exceeds j / cols + 0.001 (legged_gym)."""
-    boxes, bumps, ramps, flat = config.proportions
-    shares = np.array([boxes, bumps, 0.5 * ramps, 0.5 * ramps, flat])
+    shares = np.array(config.shares)
     cumulative = np.cumsum(shares) / shares.sum()
     kinds = np.searchsorted(cumulative, np.arange(config.cols) / config.cols + 0.001, side="right")
     last = int(np.flatnonzero(shares)[-1])  # more than 1000 columns reach past 1
@@ -232,7 +254,32 @@ def _tile(config: TerrainConfig, tile_type: str, row: int, col: int) -> FloatArr
     if tile_type in ("ramp_up", "ramp_down"):
         run = np.clip(from_border, 0.0, 0.5 * n * config.resolution - flat_to)
         return (1.0 if tile_type == "ramp_up" else -1.0) * _between(config.ramp_slope, d) * run
+    if tile_type in ("stairs_up", "stairs_down"):
+        most = math.floor((0.5 * n * config.resolution - flat_to) / config.stair_tread + 1e-9)
+        steps = np.minimum(np.floor(from_border / config.stair_tread + 1e-9), most)
+        return (1.0 if tile_type == "stairs_up" else -1.0) * _between(config.stair_rise, d) * steps
+    if tile_type == "obstacles":
+        return _between(config.obstacle_height, d) * _unit_obstacles(config, along, flat_to, rng)
+    if tile_type == "gaps":
+        floor = round(_between(config.gap_width, d) / config.resolution + 1e-9) - 1  # samples; the walls are one each
+        ring = np.rint((from_centre - flat_to) / config.resolution).astype(int)
+        every = round(GAP_SPACING / config.resolution)
+        low = (ring > 0) & (ring % every > every - 1 - floor) & (np.rint(from_border / config.resolution) > 1)
+        return np.where(low, -GAP_DEPTH, 0.0)
     return np.zeros_like(from_centre)
+
+
+def _unit_obstacles(config: TerrainConfig, along: FloatArray, flat_to: float, rng: np.random.Generator) -> FloatArray:
+    """Return blocks on ground at 0, their heights in 0.5..1, the highest 1; none is on the platform or the border."""
+    heights = np.zeros((len(along), len(along)))
+    inner = 0.5 * config.tile_size - 1.5 * config.resolution
+    for _ in range(round(OBSTACLES * config.tile_size**2)):
+        centre, half = rng.uniform(-inner, inner, 2), 0.5 * rng.uniform(*OBSTACLE_EDGE, 2)
+        inside = [(np.abs(along - c) <= h) & (np.abs(along) < inner) for c, h in zip(centre, half, strict=True)]
+        heights[np.ix_(*inside)] = rng.uniform(0.5, 1.0)
+    middle = np.abs(along) < flat_to + 1.5 * config.resolution
+    heights[np.ix_(middle, middle)] = 0.0
+    return heights / (heights.max() or 1.0)
 
 
 def _unit_boxes(config: TerrainConfig, along: FloatArray, flat_to: float, rng: np.random.Generator) -> FloatArray:
