@@ -266,7 +266,7 @@ def test_the_command_line_beats_an_experiment() -> None:
 
 
 def test_the_default_is_the_papers_task_on_flat_ground() -> None:
-    """But for the learner, short episodes, coarse steps, commands that grow to the paper's, latency and a hard floor."""
+    """But for learner, short episodes, coarse steps, commands that grow to the paper's, latency and a hard floor."""
     paper = flat(compose("train", ["experiment=paper_flat"]))
     widening = default()
     for key in ("lin_vel_x", "lin_vel_y", "ang_vel_z", "hold_time"):

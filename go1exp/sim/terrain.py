@@ -5,8 +5,8 @@ ground and follow +y, as in legged_gym. A tile is at height 0 along its whole bo
 
 The kinds follow the paper ("boxes with slight variations in height close to 0 on the z-axis", "bumpy patches by adding
 noise to terrain heights", ramps in its figure), and what other laboratories climb: stairs, obstacles, gaps. Tile grid,
-column rule and interpolation follow legged_gym, sizes the Go1 rough task of Isaac Lab. Nothing here knows the simulator: `sim/physics/scene.py` hands the field to MuJoCo,
-`mdp/ground.py` has the law of heights between samples.
+column rule and interpolation follow legged_gym, sizes the Go1 rough task of Isaac Lab. Nothing here knows the
+simulator: `sim/physics/scene.py` hands the field to MuJoCo, `mdp/ground.py` has the law of heights between samples.
 """
 
 from __future__ import annotations
