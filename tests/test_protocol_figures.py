@@ -16,7 +16,7 @@ from go1exp.config.compose import compose
 from go1exp.evaluate.protocol.base import chosen
 from go1exp.evaluate.protocol.claims import Claim, evaluated, verdict
 from go1exp.evaluate.protocol.ground import COURSE, RESOLUTION, RUN_UP, SHAPES, TREAD, UNITS, Lanes, goal
-from go1exp.evaluate.protocol.kinds import energy, gait, push_map, rate, terrain
+from go1exp.evaluate.protocol.kinds import energy, gait, hardware, push_map, rate, terrain
 from go1exp.evaluate.protocol.plan import Constant, Impulses, Kicker, Motion, Sine, Steps, heading, phasors, response
 from go1exp.evaluate.protocol.stage import delay_of_effects
 from go1exp.evaluate.quantities import FELL, FINGERPRINT, MOVING, Column, distinct, summary
@@ -133,9 +133,9 @@ def test_a_delay_of_the_robots_own_stays() -> None:
 
 def test_the_delay_margin_ends_where_the_first_robot_falls() -> None:
     rows = [{"delay_ms": d, "fell": d >= 30.0 and n == 1, "robot": n} for d in (0.0, 10.0, 20.0, 30.0) for n in (0, 1)]
-    assert energy._margin(rows) == 20.0
-    assert energy._margin([r for r in rows if r["delay_ms"] < 30.0]) == 20.0
-    assert energy._margin([{**r, "fell": True} for r in rows]) == 0.0  # beyond the limit, and not unknown
+    assert hardware._margin(rows) == 20.0
+    assert hardware._margin([r for r in rows if r["delay_ms"] < 30.0]) == 20.0
+    assert hardware._margin([{**r, "fell": True} for r in rows]) == 0.0  # beyond the limit, and not unknown
 
 
 def test_the_gain_of_a_faster_rate_is_paired() -> None:

@@ -29,8 +29,8 @@ from go1exp.evaluate.controller.mpc import Mpc
 from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
 from go1exp.evaluate.protocol import comparing
 from go1exp.evaluate.protocol.base import Chosen, chosen
+from go1exp.evaluate.protocol.kinds.corners import step_answer
 from go1exp.evaluate.protocol.kinds.push_map import largest_survived
-from go1exp.evaluate.protocol.kinds.steady import step_answer
 from go1exp.evaluate.protocol.pages import comparison, write
 from go1exp.evaluate.protocol.plan import Impulses, Plan
 from go1exp.evaluate.protocol.playing import Rates, Result, play

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from go1exp.evaluate.protocol.kinds import energy, gait, kicks, push_map, rate, sinusoid, steady, terrain
+from go1exp.evaluate.protocol.kinds import corners, energy, gait, hardware, kicks, push_map, rate, sinusoid, terrain
 
-__all__ = ["energy", "gait", "kicks", "push_map", "rate", "sinusoid", "steady", "terrain"]
+__all__ = ["corners", "energy", "gait", "hardware", "kicks", "push_map", "rate", "sinusoid", "terrain"]
