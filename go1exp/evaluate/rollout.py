@@ -138,7 +138,7 @@ def evaluate(
             if recorder:
                 recorder.end_step(tally.alive)
         on_step(step + 1, steps)
-    report = tally.report(config)
+    report = {**tally.report(config), "physics_dt": core.task.sim.physics_dt}
     if checks:
         report["agreement"] = [dataclasses.asdict(check) for check in checks]
     if recorder:

@@ -17,7 +17,17 @@ from go1exp.evaluate.agents import Agent, Progress
 from go1exp.evaluate.protocol.base import Chosen, Length, Played, Protocol
 from go1exp.evaluate.protocol.claims import Verdict, evaluated
 from go1exp.evaluate.protocol.stage import Rates, Setting, Stage
-from go1exp.evaluate.quantities import ROBOT, Derived, Row, about, by_condition, distinct, plain, summary
+from go1exp.evaluate.quantities import (
+    ROBOT,
+    Derived,
+    Row,
+    about,
+    by_condition,
+    coarse_physics,
+    distinct,
+    plain,
+    summary,
+)
 from go1exp.evaluate.statistics.intervals import Interval, bootstrap_interval
 
 
@@ -80,6 +90,8 @@ def play(
     repeats, played.rows = len(played.rows) - len(rows), rows
     figures = summarised(chosen, rows)
     stage.finished()
+    if coarse := coarse_physics(stage.physics_dt(stage.policy_dt)):
+        played.notes.append(coarse)
     about_play = {"agent": agent.about, "rates": dataclasses.asdict(rates), "go1exp": __version__, **(origin or {})}
     verdicts = evaluated(protocol.claims, figures)
     return Result(chosen, agent.label, about_play, played, repeats, figures, verdicts, time.monotonic() - began)
