@@ -324,6 +324,11 @@ def test_the_table_for_a_terminal_stands_in_columns() -> None:
         assert header.rindex(name) + len(name) == whole.index(cell) + len(cell)
 
 
+def test_the_table_says_that_physics_was_coarse() -> None:
+    assert "physics of 4 ms softens impacts" in table.text({**REPORT, "physics_dt": 0.004})
+    assert "softens" not in table.text({**REPORT, "physics_dt": 0.002})
+
+
 def test_the_table_for_a_document_is_markdown() -> None:
     lines = table.markdown(REPORT).split("\n")
     assert [line.count("|") for line in lines[:4]] == [6, 6, 6, 6]
