@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +15,15 @@ from go1exp import robot
 from go1exp.base.paths import data_root
 from go1exp.config.schema.registry import ConfigError
 from go1exp.deploy.export.contract import alternatives, at_rest, build_foreign
-from go1exp.deploy.export.foreign import ORDERS, PRESETS, Back, Front, Spec, config_of, spec_of
-from go1exp.deploy.export.foreign_graph import Network, compose_graph
+from go1exp.deploy.export.foreign import ORDERS, PRESETS, Front, Spec, config_of, spec_of
 from go1exp.deploy.export.graph import ExportError
-from go1exp.deploy.runtime.policy import OnnxPolicy
+from go1exp.deploy.runtime.bundle import load
+from go1exp.deploy.runtime.commands import CommandConfig
+from go1exp.deploy.runtime.job import Job, run_job
+from go1exp.deploy.runtime.walk import Plan
 from go1exp.train import run_folder
 from go1exp.train.policy import load_network
+from tests.lockstep import lockstep
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
 
@@ -76,33 +80,38 @@ def exported(module: nn.Module, file: Path) -> Path:
 
 @pytest.mark.slow(*ABOUT)
 @pytest.mark.parametrize("preset", PRESETS)
-def test_a_network_in_their_convention_acts_as_the_original(preset: str, tmp_path: Path) -> None:
+def test_a_network_in_their_convention_acts_as_the_original_and_is_deployed(preset: str, tmp_path: Path) -> None:
     spec, _ = spec_of(contract(tmp_path, preset), {})
     theirs = InTheirs(spec)
-    front, back = Front(spec, config_of(spec)[1]), Back(spec, config_of(spec)[1])
-    network = Network(exported(theirs, tmp_path / "policy.pt"), front.size)
+    front = Front(spec, config_of(spec)[1])
+    data, lines = build_foreign(exported(theirs, tmp_path / "policy.pt"), contract(tmp_path, preset))
+    assert "mismatch" not in lines[-1]
+    file = tmp_path / "walk.zip"
+    file.write_bytes(data)
     rng = np.random.default_rng(0)
     given = {p.name: torch.tensor(rng.normal(size=(50, p.size)), dtype=torch.float32) for p in front.inputs}
     given["imu_quat"] = nn.functional.normalize(given["imu_quat"])
     ours, _ = spec_of(contract(tmp_path, "isaaclab"), {})
     plain = Front(type(ours)(**{**ours.__dict__, "joint_order": "sdk"}), config_of(ours)[1])
     wanted = theirs.net(plain(*[given[p.name] for p in plain.inputs])[0]).detach()
-    with torch.no_grad():
-        made = OnnxPolicy(
-            compose_graph(front, back, network),
-            front.inputs,
-            tuple(
-                type(front.inputs[0])(n, s, "", "", "")
-                for n, s in (("joint_target", 12), ("observation", 48), ("action", 12))
-            ),
-        )
+    made = load(file).policy
     got = made({name: values.numpy() for name, values in given.items()})
     np.testing.assert_allclose(got["action"], wanted, rtol=0, atol=1e-4)
     np.testing.assert_allclose(got["joint_target"], robot.NOMINAL_STANCE + 0.2 * wanted.numpy(), rtol=0, atol=1e-4)
+    plan = Plan(seconds=1.0, stand_up=0.2, hand_over=0.0, lie_down=0.0, brake=0.1, command=CommandConfig((0.4, 0, 0)))
+    with lockstep():
+        assert run_job(Job(str(file), "sim", plan, str(tmp_path / "walk"), truth=True), lines.append) == 0
+    (account,) = (tmp_path / "walk").glob("*.json")
+    x, y, yaw = json.loads(account.read_text())["velocity"]["mean"]
+    assert (x, y, yaw) == (pytest.approx(0.4, abs=0.05), pytest.approx(0, abs=0.05), pytest.approx(0, abs=0.1))
 
 
 GRAVITY = (
     "observation: [lin_vel, ang_vel, {term: projected_gravity, %s}, velocity_commands, joint_pos, joint_vel, actions]"
+)
+JOINT_VELOCITY = (
+    "observation: [lin_vel, ang_vel, projected_gravity, velocity_commands, joint_pos, {term: joint_vel, scale: 0.05}, "
+    "actions]"
 )
 
 
@@ -112,15 +121,21 @@ GRAVITY = (
     [
         ("joint_order: sdk", "joint_order=joint_major"),
         ("joint_sign: -1.0", "joint_sign reversed"),
+        ("action_scale: 0.4", "action_scale x 0.5"),
+        ("preset: legged_gym", "order of preset isaaclab"),
         (GRAVITY % "scale: -1.0", "gravity frame: sign"),
+        (GRAVITY % "quaternion: inverse", "gravity frame: quaternion=wxyz"),
         (GRAVITY % "quaternion: xyzw", "quaternion order: quaternion=wxyz"),
+        (JOINT_VELOCITY, "joint_velocity scale=1"),
     ],
 )
 def test_a_wrong_contract_is_named(line: str, likely: str, tmp_path: Path) -> None:
     spec, _ = spec_of(contract(tmp_path, "isaaclab"), {})
     file = exported(InTheirs(spec), tmp_path / "policy.pt")
     wrong = tmp_path / "wrong.yaml"
-    wrong.write_text(Path(contract(tmp_path, "isaaclab")).read_text() + line + "\n")
+    key = line.partition(":")[0]
+    stated = Path(contract(tmp_path, "isaaclab")).read_text().splitlines()
+    wrong.write_text("\n".join([one for one in stated if one.partition(":")[0] != key] + [line, ""]))
     with pytest.raises(ExportError, match=f"likely mismatch.*{likely}"):
         build_foreign(file, str(wrong))
 

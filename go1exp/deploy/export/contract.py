@@ -15,7 +15,7 @@ from go1exp import robot
 from go1exp.base.tensors.threads import one_thread
 from go1exp.config.schema.history import history_columns
 from go1exp.config.schema.registry import ConfigError
-from go1exp.deploy.export.build import metadata, readings, versions
+from go1exp.deploy.export.build import AXES, metadata, readings, versions
 from go1exp.deploy.export.foreign import (
     ALIASES,
     ORDERS,
@@ -35,31 +35,58 @@ from go1exp.deploy.runtime.metadata import Trained
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TrainConfig
 
-COMMANDS = ((0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.3, 0.0), (0.0, 0.0, 0.5))
-"""Commands of the simulation, m/s, m/s, rad/s: a robot stands, another one walks forward, ..."""
+COMMANDS = ((0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.3, 0.0), (0.0, 0.0, 0.5), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+"""Commands of the simulation, m/s, m/s, rad/s: a robot stands, three move, two stand and are kicked."""
 
 STANDS, WALKS = 0, 1
 """Robots of a contract whose first targets and whose trace are kept."""
 
+MOVING, STANDING = [1, 2, 3], [0, 4, 5]
+KICKS = {4: (0.6, 0.0), 5: (0.0, 0.6)}
+"""Change of the trunk's velocity of robots that stand, m/s, at ``SETTLE``: it takes the attitude and the damping."""
+
 SECONDS, SETTLE = 2.0, 0.7
 """Length of the simulation, and its beginning, in which errors do not count, s."""
 
-BETTER, PART = 0.1, 0.5
-"""By how much another contract must follow the commands more closely to be a likely mismatch, where 1 is perfect; and
-which part of the stated contract's error may remain (chosen: a wrong attitude costs a quarter on flat ground)."""
+BETTER, STEADIER, PART, CLOSE = 0.1, 0.05, 0.5, 0.3
+"""By how much another contract must follow the commands more closely to be a likely mismatch, where 1 is perfect, or
+sway less, m/s; which part of the stated contract's error may remain (chosen: a wrong attitude costs a quarter on flat
+ground); and how far behind the likeliest another one is named, too."""
+
+USUAL: dict[str, tuple[Any, ...]] = {
+    "base_linear_velocity": (1.0, 2.0),
+    "base_angular_velocity": (1.0, 0.25, 0.2),
+    "velocity_command": (1.0, (2.0, 2.0, 0.25)),
+    "joint_position": (1.0,),
+    "joint_velocity": (1.0, 0.05),
+    "previous_action": (1.0,),
+}
+"""Scales of the four frameworks, by term."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """Seconds to the first fall, infinite if none, and how closely moving commands are followed: 1 perfect, 0 not."""
+    """What robots under a contract do.
+
+    Attributes:
+        fall: of a robot without a kick, s; infinite if none.
+        follows: how closely moving commands are followed: 1 perfect, 0 not.
+        sways: velocity error of robots that should stand, two after a kick, m/s (RMS); infinite if one falls.
+    """
 
     fall: float
     follows: float
+    sways: float
 
     @property
     def falls(self) -> bool:
         """Whether a robot falls."""
         return bool(np.isfinite(self.fall))
+
+    def __str__(self) -> str:
+        """Return what is comparable, in words."""
+        sways = f"sways {self.sways:.2f} m/s" if np.isfinite(self.sways) else "falls when kicked"
+        return f"follows the commands to {self.follows:.0%}, {sways}"
 
 
 class _Robots:
@@ -99,11 +126,15 @@ class _Robots:
         return {"time": np.array([t]), **{k: v[WALKS : WALKS + 1].numpy().copy() for k, v in values.items()}}
 
 
-def _outcomes(errors: np.ndarray, fall: np.ndarray) -> list[Outcome]:
-    """Return the outcomes of S contracts from mean velocity errors (S, C, 3) and times of falls (S, C), s."""
-    sizes = np.linalg.norm(np.array(COMMANDS[1:]), axis=-1)
-    follows = (1.0 - np.linalg.norm(errors[:, 1:], axis=-1) / sizes).mean(axis=1)
-    return [Outcome(float(first), float(share)) for first, share in zip(fall.min(axis=1), follows, strict=True)]
+def _outcomes(errors: np.ndarray, fall: np.ndarray, commands: np.ndarray) -> list[Outcome]:
+    """Return outcomes of S contracts from velocity errors (T, S, C, 3), falls (S, C), s, and commands (C, 3)."""
+    sizes = np.maximum(np.linalg.norm(commands, axis=-1), 0.3)  # a command of zero is followed, too
+    follows = (1.0 - np.linalg.norm(errors.mean(axis=0), axis=-1) / sizes)[:, MOVING].mean(axis=1)
+    late = errors[len(errors) // 3 :]  # the kick itself is the same for all
+    sways = np.sqrt((late**2).sum(axis=-1).mean(axis=0))
+    sways = np.where(np.isfinite(fall), np.inf, sways)[:, STANDING].mean(axis=1)
+    first = np.delete(fall, list(KICKS), axis=1).min(axis=1)
+    return [Outcome(*map(float, values)) for values in zip(first, follows, sways, strict=True)]
 
 
 def drive(
@@ -119,7 +150,9 @@ def drive(
     sim = dataclasses.replace(config.task.sim, episode_s=2 * SECONDS, spread_starts=False)
     core = Go1Core(dataclasses.replace(config.task, sim=sim), each * len(specs), noise=False)
     core.reset()
-    commands = torch.tensor(COMMANDS).repeat(len(specs), 1)
+    low, high = np.array([specs[0].command_ranges.get(axis, (-1.0, 1.0)) for axis in AXES]).T
+    wanted = np.clip(COMMANDS, low, high)
+    commands = torch.as_tensor(wanted, dtype=torch.float32).repeat(len(specs), 1)
     # all act in the units of the first
     groups = [_Robots(spec, config, slice(k * each, (k + 1) * each)) for k, spec in enumerate(specs)]
     fall = np.full(len(commands), np.inf)
@@ -139,7 +172,10 @@ def drive(
         s = core.snapshot()
         if step * period >= SETTLE:
             errors.append((torch.cat([s.base_lin_vel_b[:, :2], s.base_ang_vel_b[:, 2:]], dim=1) - commands).numpy())
-    outcomes = _outcomes(np.mean(errors, axis=0).reshape(len(specs), each, 3), fall.reshape(len(specs), each))
+        if step == round(SETTLE / period):
+            for row, kick in KICKS.items():
+                core.backend.qvel[row::each, :2] += torch.tensor(kick, dtype=core.backend.qvel.dtype)
+    outcomes = _outcomes(np.array(errors).reshape(-1, len(specs), each, 3), fall.reshape(len(specs), each), wanted)
     return outcomes, {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}, rest
 
 
@@ -155,6 +191,14 @@ def alternatives(spec: Spec) -> Iterator[tuple[str, Spec]]:
     yield "sign: action_scale reversed", change(spec, action_scale=tuple(-scale))
     for factor in (0.5, 2.0):
         yield f"scale: action_scale x {factor:g}", change(spec, action_scale=tuple(factor * scale))
+    stated = dict(zip(map(_name, spec.observation), spec.observation, strict=True))
+    for preset in ("isaaclab", "mjlab", "legged_gym"):
+        theirs = spec_of(preset, {})[0]
+        terms = {_name(o): o for o in theirs.observation}
+        if set(terms) == set(stated):
+            kept = [change(o, history=stated[n].history, parameters=stated[n].parameters) for n, o in terms.items()]
+            other = change(spec, observation=tuple(kept), joint_order=theirs.joint_order, **by_name)
+            yield f"terms, scales and joint order of preset {preset}", other
     nominal = dict(zip(robot.JOINTS, STANCE, strict=True))
     yield "default pose: the nominal stance", change(spec, default_pose=nominal)
     yield "default pose: that of preset mjlab", change(spec, default_pose=PRESETS["mjlab"]["default_pose"])
@@ -166,7 +210,7 @@ def alternatives(spec: Spec) -> Iterator[tuple[str, Spec]]:
 
 def _other_readings(observed: Observed) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield what a term may be in place of what is stated: name, and attributes of ``Observed``."""
-    name = ALIASES.get(observed.term, observed.term)
+    name = _name(observed)
     if name == "projected_gravity":
         yield "gravity frame: sign", {"scale": tuple(-np.broadcast_to(observed.scale, 3))}
         for kind in sorted({"wxyz", "xyzw", "inverse"} - {observed.quaternion}):
@@ -174,10 +218,13 @@ def _other_readings(observed: Observed) -> Iterator[tuple[str, dict[str, Any]]]:
             yield f"{what}: quaternion={kind}", {"quaternion": kind}
     if name == "joint_position":
         yield f"joint_position: relative={not observed.relative}", {"relative": not observed.relative}
-    usual = {ALIASES.get(e["term"], e["term"]): e.get("scale", 1.0) for e in PRESETS["legged_gym"]["observation"]}
-    theirs = usual.get(name, 1.0)
-    for scale in {1.0, tuple(theirs) if isinstance(theirs, list) else theirs} - {observed.scale}:
-        yield f"scale: {name} x {scale}", {"scale": scale}
+    for scale in USUAL.get(name, ()):
+        if not np.allclose(observed.scale, scale):
+            yield f"scale: {name} scale={scale}", {"scale": scale}
+
+
+def _name(observed: Observed) -> str:
+    return ALIASES.get(observed.term, observed.term)
 
 
 def build_foreign(file: Path, given: str, *, force: bool = False) -> tuple[bytes, list[str]]:
@@ -204,15 +251,19 @@ def build_foreign(file: Path, given: str, *, force: bool = False) -> tuple[bytes
     front, back = Front(spec, config), Back(spec, config)
     if network.size not in (None, front.size):
         terms = ", ".join(f"{b.key} {b.entry.traits['size']}" for b in config.task.observation)
-        raise ConfigError([f"observation: {front.size} numbers ({terms}); the network takes {network.size}"])
+        raise ConfigError(
+            [f"observation: {front.size} numbers ({terms}); the network takes {network.size}{_hint(network, front)}"]
+        )
     with one_thread(), torch.no_grad():
         (stated,), trace, rest = drive(config, [spec], network)
-        likely = _likelier(stated, config, spec, network)
+        likely, alike = _likelier(stated, config, spec, network)
         model = compose_graph(front, back, network)
     what = f"falls after {stated.fall:.2f} s" if stated.falls else f"stands {SECONDS:g} s"
-    verdict = f"with the stated contract it {what} and follows the commands to {stated.follows:.0%}"
+    verdict = f"with the stated contract it {what} and {stated}"
     if likely:
         verdict += f"; likely mismatch, since it stands with: {'; '.join(likely)}"
+    elif alike:
+        lines = [*lines, f"note: not checked, since it moves the same with {'; '.join(alike)}"]
     if (likely or stated.falls) and not force:
         raise ExportError(f"{file}: {verdict}; force=true imports it all the same")
     described = metadata(config.task, front.inputs, Trained(file.name, network.sha256, 0, 0))
@@ -221,15 +272,37 @@ def build_foreign(file: Path, given: str, *, force: bool = False) -> tuple[bytes
     return data, [*lines, *at_rest(spec, rest), verdict]
 
 
-def _likelier(stated: Outcome, config: TrainConfig, spec: Spec, network: Network) -> list[str]:
-    """Return up to three contracts under which a policy that falls, or follows badly, stands and follows better."""
-    if not stated.falls and stated.follows >= 1 - BETTER:
-        return []
+def _hint(network: Network, front: Front) -> str:
+    """Return what a network of another size probably reads."""
+    size = network.size or 0
+    if size % front.size == 0:
+        return f": history={size // front.size}?"
+    known = {-3: "no base_linear_velocity?", 187: "a height scan of 17 x 11, which the robot does not measure?"}
+    return f": {known[size - front.size]}" if size - front.size in known else ""
+
+
+def _likelier(stated: Outcome, config: TrainConfig, spec: Spec, network: Network) -> tuple[list[str], list[str]]:
+    """Return contracts that are likelier than the stated one of a policy that does not work, and those that act alike.
+
+    Of the likelier ones up to three: the policy stands, and follows more closely, or sways less and follows as closely.
+    """
+    if not stated.falls and stated.follows >= 1 - BETTER and np.isfinite(stated.sways):
+        return [], []
     others = list(alternatives(spec))
     outcomes, _, _ = drive(config, [other for _, other in others], network)
-    stands = [(r.follows, name) for r, (name, _) in zip(outcomes, others, strict=True) if not r.falls]
     least = -np.inf if stated.falls else max(stated.follows + BETTER, 1.0 - PART * (1.0 - stated.follows))
-    return [f"{name} (follows {share:.0%})" for share, name in sorted(stands, reverse=True) if share > least][:3]
+    calm = min(PART * stated.sways, stated.sways - STEADIER)
+    likely, alike = [], []
+    for (name, _), one in zip(others, outcomes, strict=True):
+        # stance and stiffness change how a robot sways, whatever its policy reads
+        read = not name.startswith(("default pose", "scale: action"))
+        steadier = read and one.sways < calm and one.follows > stated.follows - STEADIER
+        if not one.falls and (one.follows > least or steadier):
+            likely.append((one.follows - one.sways, f"{name} ({one})"))
+        elif read and np.allclose((one.follows, one.sways), (stated.follows, stated.sways), rtol=0, atol=0.01):
+            alike.append(name)
+    likely.sort(reverse=True)
+    return [text for score, text in likely[:3] if score > likely[0][0] - CLOSE], alike
 
 
 def at_rest(spec: Spec, target: np.ndarray) -> list[str]:

@@ -96,6 +96,8 @@ def _converted(file: Path, size: int | None) -> Any:
         raise ExportError(
             f"{file}: not TorchScript; a checkpoint of weights has no network: export policy.pt or policy.onnx first"
         ) from None
+    if any(getattr(m, "original_name", "") in ("LSTM", "GRU", "RNN", "LSTMCell", "GRUCell") for m in script.modules()):
+        raise ExportError(f"{file}: remembers (a recurrent layer): recurrent policies are not imported")
     if size is None:
         raise ExportError(f"{file}: TorchScript does not say the size of its input; give spec=")
     probe, made = torch.linspace(-1, 1, 2 * size).reshape(2, size), io.BytesIO()
