@@ -130,8 +130,8 @@ def _outcomes(errors: np.ndarray, fall: np.ndarray, commands: np.ndarray) -> lis
     """Return outcomes of S contracts from velocity errors (T, S, C, 3), falls (S, C), s, and commands (C, 3)."""
     sizes = np.maximum(np.linalg.norm(commands, axis=-1), 0.3)  # a command of zero is followed, too
     follows = (1.0 - np.linalg.norm(errors.mean(axis=0), axis=-1) / sizes)[:, MOVING].mean(axis=1)
-    late = errors[len(errors) // 3 :]  # the kick itself is the same for all
-    sways = np.sqrt((late**2).sum(axis=-1).mean(axis=0))
+    settled = errors[len(errors) // 3 :]  # the kick itself is the same for all
+    sways = np.sqrt((settled**2).sum(axis=-1).mean(axis=0))
     sways = np.where(np.isfinite(fall), np.inf, sways)[:, STANDING].mean(axis=1)
     first = np.delete(fall, list(KICKS), axis=1).min(axis=1)
     return [Outcome(*map(float, values)) for values in zip(first, follows, sways, strict=True)]
@@ -191,6 +191,13 @@ def alternatives(spec: Spec) -> Iterator[tuple[str, Spec]]:
     yield "sign: action_scale reversed", change(spec, action_scale=tuple(-scale))
     for factor in (0.5, 2.0):
         yield f"scale: action_scale x {factor:g}", change(spec, action_scale=tuple(factor * scale))
+    nominal = dict(zip(robot.JOINTS, STANCE, strict=True))
+    yield "default pose: the nominal stance", change(spec, default_pose=nominal)
+    yield "default pose: that of preset mjlab", change(spec, default_pose=PRESETS["mjlab"]["default_pose"])
+    for k, observed in enumerate(spec.observation):
+        for text, values in _other_readings(observed):
+            terms = [*spec.observation[:k], change(observed, **values), *spec.observation[k + 1 :]]
+            yield text, change(spec, observation=tuple(terms))
     stated = dict(zip(map(_name, spec.observation), spec.observation, strict=True))
     for preset in ("isaaclab", "mjlab", "legged_gym"):
         theirs = spec_of(preset, {})[0]
@@ -199,13 +206,6 @@ def alternatives(spec: Spec) -> Iterator[tuple[str, Spec]]:
             kept = [change(o, history=stated[n].history, parameters=stated[n].parameters) for n, o in terms.items()]
             other = change(spec, observation=tuple(kept), joint_order=theirs.joint_order, **by_name)
             yield f"terms, scales and joint order of preset {preset}", other
-    nominal = dict(zip(robot.JOINTS, STANCE, strict=True))
-    yield "default pose: the nominal stance", change(spec, default_pose=nominal)
-    yield "default pose: that of preset mjlab", change(spec, default_pose=PRESETS["mjlab"]["default_pose"])
-    for k, observed in enumerate(spec.observation):
-        for text, values in _other_readings(observed):
-            terms = [*spec.observation[:k], change(observed, **values), *spec.observation[k + 1 :]]
-            yield text, change(spec, observation=tuple(terms))
 
 
 def _other_readings(observed: Observed) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -263,7 +263,8 @@ def build_foreign(file: Path, given: str, *, force: bool = False) -> tuple[bytes
     if likely:
         verdict += f"; likely mismatch, since it stands with: {'; '.join(likely)}"
     elif alike:
-        lines = [*lines, f"note: not checked, since it moves the same with {'; '.join(alike)}"]
+        remaining = f" and {len(alike) - 5} others" if len(alike) > 5 else ""
+        lines = [*lines, f"note: not checked, since it moves the same with {'; '.join(alike[:5])}{remaining}"]
     if (likely or stated.falls) and not force:
         raise ExportError(f"{file}: {verdict}; force=true imports it all the same")
     described = metadata(config.task, front.inputs, Trained(file.name, network.sha256, 0, 0))
@@ -298,10 +299,10 @@ def _likelier(stated: Outcome, config: TrainConfig, spec: Spec, network: Network
         read = not name.startswith(("default pose", "scale: action"))
         steadier = read and one.sways < calm and one.follows > stated.follows - STEADIER
         if not one.falls and (one.follows > least or steadier):
-            likely.append((one.follows - one.sways, f"{name} ({one})"))
+            likely.append((round(one.follows - one.sways, 2), f"{name} ({one})"))
         elif read and np.allclose((one.follows, one.sways), (stated.follows, stated.sways), rtol=0, atol=0.01):
             alike.append(name)
-    likely.sort(reverse=True)
+    likely.sort(key=lambda scored: -scored[0])  # of equal ones the change of one key comes first
     return [text for score, text in likely[:3] if score > likely[0][0] - CLOSE], alike
 
 
