@@ -201,9 +201,9 @@ def alternatives(spec: Spec) -> Iterator[tuple[str, Spec]]:
     stated = dict(zip(map(_name, spec.observation), spec.observation, strict=True))
     for preset in ("isaaclab", "mjlab", "legged_gym"):
         theirs = spec_of(preset, {})[0]
-        terms = {_name(o): o for o in theirs.observation}
-        if set(terms) == set(stated):
-            kept = [change(o, history=stated[n].history, parameters=stated[n].parameters) for n, o in terms.items()]
+        by_term = {_name(o): o for o in theirs.observation}
+        if set(by_term) == set(stated):
+            kept = [change(o, history=stated[n].history, parameters=stated[n].parameters) for n, o in by_term.items()]
             other = change(spec, observation=tuple(kept), joint_order=theirs.joint_order, **by_name)
             yield f"terms, scales and joint order of preset {preset}", other
 
