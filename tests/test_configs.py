@@ -265,8 +265,21 @@ def test_the_command_line_beats_an_experiment() -> None:
     assert compose("train", ["experiment=paper", "ppo=cpu"])["ppo"] == compose("train")["ppo"]
 
 
+def test_a_training_takes_its_own_physics_step_and_an_evaluation_that_of_the_task() -> None:
+    def steps(*overrides: str) -> tuple[float, float]:
+        config = parse_train(compose("train", list(overrides)))
+        return config.trained_task.sim.physics_dt, config.task.sim.physics_dt
+
+    assert steps() == (0.004, 0.002)
+    assert steps("ppo.coarse_physics=1") == steps("ppo=warp") == (0.002, 0.002)
+    assert steps("experiment=five_minutes") == (0.01, 0.01)
+    assert steps("sim.policy_dt=0.01") == (pytest.approx(0.01 / 3), 0.002)
+    assert steps("sim.physics_dt=0.001") == (0.002, 0.001)
+    assert steps("actuator=net_simulated", "actuator.period=exact") == (0.002, 0.002)  # a history of its own spacing
+
+
 def test_the_default_is_the_papers_task_on_flat_ground() -> None:
-    """But for learner, short episodes, coarse steps, commands that grow to the paper's, latency and a hard floor."""
+    """But for the learner, shorter episodes, commands that grow to the paper's, latency and a hard floor."""
     paper = flat(compose("train", ["experiment=paper_flat"]))
     widening = default()
     for key in ("lin_vel_x", "lin_vel_y", "ang_vel_z", "hold_time"):
@@ -276,7 +289,7 @@ def test_the_default_is_the_papers_task_on_flat_ground() -> None:
         return {
             k: v
             for k, v in values.items()
-            if not k.startswith(("ppo.", "command.", "actuator.", "contact.", "sim.episode_s", "sim.physics_dt"))
+            if not k.startswith(("ppo.", "command.", "actuator.", "contact.", "sim.episode_s"))
         }
 
     assert others(paper) == others(widening)

@@ -34,9 +34,9 @@ from go1exp.evaluate.protocol.kinds.push_map import largest_survived
 from go1exp.evaluate.protocol.pages import comparison, write
 from go1exp.evaluate.protocol.plan import Impulses, Plan
 from go1exp.evaluate.protocol.playing import Rates, Result, play
-from go1exp.evaluate.protocol.stage import Setting, Stage, fitting_step
+from go1exp.evaluate.protocol.stage import Setting, Stage
 from go1exp.evaluate.quantities import FINGERPRINT, ROBOT
-from go1exp.sim.task import TaskConfig
+from go1exp.sim.task import TaskConfig, fitting_step
 from tests.test_every_key_acts import unread
 
 SMALL = {

@@ -81,8 +81,7 @@ def _task(container: dict[str, Any]) -> None:
 
     on_gpu = settings.suite == "gpu"
     engine = "backend=warp" if on_gpu else f"backend.threads={settings.threads}"
-    # the step of evaluations on both engines, so that ratios are of the same physics
-    overrides = [engine, "sim.physics_dt=0.002", *settings.overrides]
+    overrides = [engine, "ppo.coarse_physics=1", *settings.overrides]  # trainings step as what they are compared with
     container = compose("train", overrides)
     config = parse_train(container)
 

@@ -134,7 +134,7 @@ def build(config: TrainConfig, group: Group | None = None) -> AdaptivePPO:
     local = group.rows(config.ppo.num_envs)
     share: dict[str, Any] = {"num_envs": local.stop - local.start, "first_env": local.start}
     share["changing"] = {ramp.path for ramp in config.schedule.values()}
-    core = Go1Core(config.task, seed=seed, **share, spread_starts=config.task.sim.spread_starts, critic=True)
+    core = Go1Core(config.trained_task, seed=seed, **share, spread_starts=config.task.sim.spread_starts, critic=True)
     device = str(core.device) if config.process.device == "auto" else config.process.device
     if core.device.type == torch.device(device).type == "cuda" or group.size > 1:
         ppo: AdaptivePPO = DevicePPO(config.ppo, Go1VecEnv(core), seed, device, group)

@@ -43,6 +43,8 @@ class PPOConfig(Strict):
         matmul_precision: ``highest`` is float32; ``bf16`` runs the update's matrix products in bfloat16; ``auto`` is
             ``bf16`` on a processor with units for it and ``highest`` on all others, which are much slower in it.
         symmetry: join each minibatch with its mirror image, left for right (Mittal et al., arXiv 2403.04359).
+        coarse_physics: physics step of the training over sim.physics_dt, which evaluations take. It is made shorter
+            where it does not divide sim.policy_dt, and a net keeps its own period.
     """
 
     num_envs: Count
@@ -69,6 +71,7 @@ class PPOConfig(Strict):
     matmul_precision: Literal["highest", "bf16", "auto"]
     symmetry: bool = False  # runs of older versions do not have the key
     max_kl: Positive | None = None  # nor this one
+    coarse_physics: Count = 1
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import ceil
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from go1exp.evaluate.recorder import Recorder, bytes_per_step
 from go1exp.evaluate.rollout import DELAY, EvalConfig, delayed, evaluation_task, planar_velocity, require_agreement
 from go1exp.mdp.commands import FixedVelocity
 from go1exp.sim.env.core import Go1Core
-from go1exp.sim.task import TaskConfig
+from go1exp.sim.task import TaskConfig, fitting_step
 
 
 @dataclass(frozen=True)
@@ -254,11 +253,6 @@ class Session:
 def delay_of_effects(task: TaskConfig) -> float:
     """Return the command delay by the effects of a task, without their spread, s."""
     return sum(float(e.parameters["delay"]) for e in task.effect if e.entry.name == DELAY)
-
-
-def fitting_step(policy_dt: float, physics_dt: float) -> float:
-    """Return the largest physics step, at most ``physics_dt``, of which the policy's period is a whole multiple, s."""
-    return policy_dt / ceil(policy_dt / physics_dt - 1e-6)
 
 
 def _with_friction(terms: tuple[Term, ...], bounds: tuple[float, float]) -> tuple[Term, ...]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
@@ -19,7 +18,7 @@ from go1exp.evaluate.rollout import EvalConfig, delayed, evaluation_task
 from go1exp.sim.effects.base import Param
 from go1exp.sim.effects.rules import actuator_problems
 from go1exp.sim.effects.tolerances import Tolerances
-from go1exp.sim.task import TaskConfig, parse_parts
+from go1exp.sim.task import TaskConfig, fitting_step, parse_parts
 from go1exp.sim.terrain import TerrainConfig, build_terrain
 
 Velocity = tuple[float, float, float]
@@ -253,7 +252,7 @@ def task_under(task: TaskConfig, setup: Setup, known: Mapping[str, Ground], effe
         randomize=setup.randomize,
         push=setup.push,
         seed=setup.seed,
-        physics_dt=period / math.ceil(period / step - 1e-6),
+        physics_dt=fitting_step(period, step),
         engine=setup.engine,
     )
     ground, effect = known[setup.ground].built(setup.level), active(setup.sizes, effects, task.actuator, task.contact)
