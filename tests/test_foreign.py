@@ -140,6 +140,26 @@ def test_a_wrong_contract_is_named(line: str, likely: str, tmp_path: Path) -> No
         build_foreign(file, str(wrong))
 
 
+@pytest.mark.slow(*ABOUT)
+@pytest.mark.parametrize("preset", PRESETS)
+def test_of_a_policy_that_does_nothing_no_mismatch_is_named(preset: str, tmp_path: Path) -> None:
+    still = nn.Linear(48, 12)
+    nn.init.zeros_(still.weight)
+    nn.init.zeros_(still.bias)
+    _, lines = build_foreign(exported(still, tmp_path / "policy.pt"), preset)
+    assert "stands 2 s" in lines[-1]
+    assert "mismatch" not in lines[-1]
+    assert any(line.startswith("note: not checked") and "others" in line for line in lines)
+
+
+@pytest.mark.slow(*ABOUT)
+def test_a_policy_of_mjlab_stated_as_one_of_isaaclab_is_named(tmp_path: Path) -> None:
+    spec, _ = spec_of(contract(tmp_path, "mjlab"), {})
+    file = exported(InTheirs(spec), tmp_path / "policy.pt")
+    with pytest.raises(ExportError, match=r"likely mismatch.*order of preset mjlab"):
+        build_foreign(file, contract(tmp_path, "isaaclab"))
+
+
 def test_metadata_of_the_file_and_sizes(tmp_path: Path) -> None:
     props = {
         "joint_names": ",".join(f"{n}_joint" for n in ORDERS["leg_major"]),

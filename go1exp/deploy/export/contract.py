@@ -93,6 +93,9 @@ class _Robots:
     """The robots of one contract: ``rows`` of an environment, which observe and act by it."""
 
     def __init__(self, spec: Spec, config: TrainConfig, rows: slice) -> None:
+        terms = {term.key: term for term in config.task.observation}  # another contract may have another order
+        ordered = tuple(terms[_name(observed)] for observed in spec.observation)
+        config = dataclasses.replace(config, task=dataclasses.replace(config.task, observation=ordered))
         self.rows, self._front, self._back = rows, Front(spec, config), Back(spec, config)
         self._history, self._past = history_columns(config.task.observation), None
 
@@ -295,8 +298,8 @@ def _likelier(stated: Outcome, config: TrainConfig, spec: Spec, network: Network
     calm = min(PART * stated.sways, stated.sways - STEADIER)
     likely, alike = [], []
     for (name, _), one in zip(others, outcomes, strict=True):
-        # stance and stiffness change how a robot sways, whatever its policy reads
-        read = not name.startswith(("default pose", "scale: action"))
+        # stance and stiffness change how a robot sways, whatever its policy reads; a sign turns the stance, too
+        read = not name.startswith(("default pose", "scale: action", "sign"))
         steadier = read and one.sways < calm and one.follows > stated.follows - STEADIER
         if not one.falls and (one.follows > least or steadier):
             likely.append((round(one.follows - one.sways, 2), f"{name} ({one})"))
