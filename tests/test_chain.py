@@ -29,7 +29,7 @@ STEP = 0.002
 
 LIVELY = (
     *("ppo.learning_rate=0.03", "ppo.learning_rate_range=[0.03,0.03]", "action.scale=0.35"),
-    *("actuator.kp=35", "actuator.kd=0.7"),
+    *("actuator.kp=35", "actuator.kd=0.7", "ppo.coarse_physics=1"),
 )
 """A policy of two iterations that moves the legs a little."""
 

@@ -39,6 +39,7 @@ from go1exp.gap.robots.description import parse_model
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TrainConfig, parse_parts, parse_train
 from go1exp.train import preflight
+from go1exp.train.trainer import trained_task
 from tests.test_extending import files as files_of_extending
 from tests.test_own_robot import files as files_of_own_robot
 
@@ -268,7 +269,7 @@ def test_the_command_line_beats_an_experiment() -> None:
 def test_a_training_takes_its_own_physics_step_and_an_evaluation_that_of_the_task() -> None:
     def steps(*overrides: str) -> tuple[float, float]:
         config = parse_train(compose("train", list(overrides)))
-        return config.trained_task.sim.physics_dt, config.task.sim.physics_dt
+        return trained_task(config).sim.physics_dt, config.task.sim.physics_dt
 
     assert steps() == (0.004, 0.002)
     assert steps("ppo.coarse_physics=1") == steps("ppo=warp") == (0.002, 0.002)

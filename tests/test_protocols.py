@@ -23,6 +23,7 @@ import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
 from go1exp.base.paths import data_root
 from go1exp.cli.evaluate import refuse
 from go1exp.config.compose import compose
+from go1exp.config.schema.physics import fitting_step
 from go1exp.config.schema.registry import ConfigError, members
 from go1exp.evaluate.agents import Agent, ControllerAgent, PolicyAgent
 from go1exp.evaluate.controller.mpc import Mpc
@@ -36,7 +37,7 @@ from go1exp.evaluate.protocol.plan import Impulses, Plan
 from go1exp.evaluate.protocol.playing import Rates, Result, play
 from go1exp.evaluate.protocol.stage import Setting, Stage
 from go1exp.evaluate.quantities import FINGERPRINT, ROBOT
-from go1exp.sim.task import TaskConfig, fitting_step
+from go1exp.sim.task import TaskConfig
 from tests.test_every_key_acts import unread
 
 SMALL = {

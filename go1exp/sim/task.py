@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from functools import cache
 from typing import Annotated, Any, Literal
 
@@ -40,7 +40,7 @@ from go1exp.config.schema.training import WandbConfig as WandbConfig
 from go1exp.mdp import mirror
 from go1exp.robot.config import RobotConfig
 from go1exp.sim import schedule
-from go1exp.sim.effects.rules import actuator_problems, nested_actuators
+from go1exp.sim.effects.rules import actuator_problems
 from go1exp.sim.terrain import TerrainConfig
 
 
@@ -147,15 +147,6 @@ class TrainConfig:
     video: VideoDuring = BESIDE["video"]
     stop: StopRule = BESIDE["stop"]
     schedule: Mapping[str, Ramp] = field(default_factory=dict)
-
-    @property
-    def trained_task(self) -> TaskConfig:
-        """The task with the physics step of the training; a net whose history has another spacing keeps its own."""
-        factor, task = self.ppo.coarse_physics, self.task
-        if factor == 1 or any(term.parameters.get("period") == "exact" for term, _ in nested_actuators(task.actuator)):
-            return task
-        step = fitting_step(task.sim.policy_dt, factor * task.sim.physics_dt)
-        return replace(task, sim=replace(task.sim, physics_dt=step))
 
 
 class RewardSlots(BaseModel):
@@ -307,11 +298,6 @@ def required_parts(container: Mapping[str, Any]) -> dict[str, Any]:
     if problems:
         raise ConfigError(problems)
     return parts
-
-
-def fitting_step(policy_dt: float, physics_dt: float) -> float:
-    """Return the largest physics step, at most ``physics_dt``, of which the policy's period is a whole multiple, s."""
-    return policy_dt / math.ceil(policy_dt / physics_dt - 1e-6)
 
 
 def time_rules(sim: SimConfig) -> list[str]:

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any
@@ -19,11 +20,13 @@ from stable_baselines3.common.logger import Logger
 
 from go1exp.base import signals
 from go1exp.base.files import opened, write_json
+from go1exp.config.schema.physics import fitting_step
 from go1exp.config.schema.registry import Expected
+from go1exp.sim.effects.rules import nested_actuators
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.faults import NumericalFault
 from go1exp.sim.env.sb3_env import Go1VecEnv
-from go1exp.sim.task import TrainConfig, parse_train
+from go1exp.sim.task import TaskConfig, TrainConfig, parse_train
 from go1exp.train import checkpoint, metrics, preflight, run_folder
 from go1exp.train.asynchronous import AsyncEvaluation
 from go1exp.train.device import DevicePPO
@@ -121,6 +124,15 @@ class Stopped(Expected):
         self.finished = finished
 
 
+def trained_task(config: TrainConfig) -> TaskConfig:
+    """Return the task with the physics step of the training; a net with a history of its own spacing keeps its step."""
+    factor, task = config.ppo.coarse_physics, config.task
+    if factor == 1 or any(term.parameters.get("period") == "exact" for term, _ in nested_actuators(task.actuator)):
+        return task
+    step = fitting_step(task.sim.policy_dt, factor * task.sim.physics_dt)
+    return replace(task, sim=replace(task.sim, physics_dt=step))
+
+
 def build(config: TrainConfig, group: Group | None = None) -> AdaptivePPO:
     """Build learner and environment, of a member of ``group`` with its share of the robots.
 
@@ -134,7 +146,7 @@ def build(config: TrainConfig, group: Group | None = None) -> AdaptivePPO:
     local = group.rows(config.ppo.num_envs)
     share: dict[str, Any] = {"num_envs": local.stop - local.start, "first_env": local.start}
     share["changing"] = {ramp.path for ramp in config.schedule.values()}
-    core = Go1Core(config.trained_task, seed=seed, **share, spread_starts=config.task.sim.spread_starts, critic=True)
+    core = Go1Core(trained_task(config), seed=seed, **share, spread_starts=config.task.sim.spread_starts, critic=True)
     device = str(core.device) if config.process.device == "auto" else config.process.device
     if core.device.type == torch.device(device).type == "cuda" or group.size > 1:
         ppo: AdaptivePPO = DevicePPO(config.ppo, Go1VecEnv(core), seed, device, group)

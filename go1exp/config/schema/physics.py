@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -26,6 +27,11 @@ class Engine(Strict):
     def as_reference(self) -> CpuBackend:
         """Return the settings of the engine that policies are evaluated on, wherever they were trained: MuJoCo's."""
         return CpuBackend("cpu", threads=0)
+
+
+def fitting_step(policy_dt: float, physics_dt: float) -> float:
+    """Return the largest physics step, at most ``physics_dt``, of which the policy's period is a whole multiple, s."""
+    return policy_dt / math.ceil(policy_dt / physics_dt - 1e-6)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from go1exp.config.schema.physics import BackendConfig
+from go1exp.config.schema.physics import BackendConfig, fitting_step
 from go1exp.config.schema.registry import Entry, Term, members
 from go1exp.evaluate.agents import Agent, Progress
 from go1exp.evaluate.controller.types import TrunkVelocity
@@ -21,7 +21,7 @@ from go1exp.evaluate.recorder import Recorder, bytes_per_step
 from go1exp.evaluate.rollout import DELAY, EvalConfig, delayed, evaluation_task, planar_velocity, require_agreement
 from go1exp.mdp.commands import FixedVelocity
 from go1exp.sim.env.core import Go1Core
-from go1exp.sim.task import TaskConfig, fitting_step
+from go1exp.sim.task import TaskConfig
 
 
 @dataclass(frozen=True)

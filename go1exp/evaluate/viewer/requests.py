@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 from go1exp import robot
 from go1exp.config.choices import choice_files, config_folder, load
 from go1exp.config.schema.joint_values import JointValues, numbers
-from go1exp.config.schema.physics import BackendConfig, ContactConfig
+from go1exp.config.schema.physics import BackendConfig, ContactConfig, fitting_step
 from go1exp.config.schema.registry import ConfigError, Term
 from go1exp.evaluate.protocol.ground import UNITS, GroundName, Lanes
 from go1exp.evaluate.protocol.stage import delay_of_effects
@@ -18,7 +18,7 @@ from go1exp.evaluate.rollout import EvalConfig, delayed, evaluation_task
 from go1exp.sim.effects.base import Param
 from go1exp.sim.effects.rules import actuator_problems
 from go1exp.sim.effects.tolerances import Tolerances
-from go1exp.sim.task import TaskConfig, fitting_step, parse_parts
+from go1exp.sim.task import TaskConfig, parse_parts
 from go1exp.sim.terrain import TerrainConfig, build_terrain
 
 Velocity = tuple[float, float, float]
