@@ -598,7 +598,7 @@ class Walk:
         """The configuration, interpolations unresolved, in which a leaf is tried."""
         needs = self.needs(leaf)
         if leaf.file == "actuator/net":  # its period is not the simulation's, so that it matters what is done then
-            needs = [f"actuator.file={self.net(0)}", "actuator.period=hold"]
+            needs = [f"actuator.file={self.net(0)}", "actuator.period=hold", "ppo.coarse_physics=1"]
         container = small(leaf.program, compose(leaf.program, (*leaf.choice, *needs)))
         return put(container, "excitation", ["policy"]) if "excitation=[policy]" in needs else container
 
