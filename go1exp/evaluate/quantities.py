@@ -219,7 +219,7 @@ KEYS = ("x", "y", "yaw")  # columns that say the command: m/s, m/s, rad/s
 SEPARATE = 3  # a draw of more numbers than these stands as their mean and their range
 
 
-def coarse_physics(step: float) -> str:
+def coarse_note(step: float) -> str:
     """Return what a reader must know of an evaluation with a physics step of so many s; empty up to 2 ms."""
     return f"physics of {1e3 * step:g} ms softens impacts; physics_dt=0.002 is finer" if step > 0.0021 else ""
 

@@ -9,7 +9,7 @@ from typing import Any
 import go1exp.base.report.table as kit
 from go1exp.base.report.table import aligned
 from go1exp.evaluate.criteria import Verdict, evaluated
-from go1exp.evaluate.quantities import coarse_physics
+from go1exp.evaluate.quantities import coarse_note
 from go1exp.evaluate.rollout import AXES
 
 HEADER = ("command x, y, yaw", "mean x, y, yaw", "RMSE x, y, yaw", "falls", "mean time s")
@@ -117,7 +117,7 @@ def _summary(report: dict[str, Any]) -> str:
         f"falls {report['falls']} in {report['episodes']} episodes of {settings['seconds']:g} s; "
         f"with {', '.join(on) if on else 'no noise, randomisation or pushes, on flat ground'}"
         + (f"; moved by {settings['engine']['name']}" if report.get("agreement") else "")
-        + (f"; {coarse}" if (coarse := coarse_physics(report.get("physics_dt", 0.0))) else "")
+        + (f"; {note}" if (note := coarse_note(report.get("physics_dt", 0.0))) else "")
     )
 
 

@@ -73,7 +73,7 @@ class Metadata:
         torque_limit: (J,) N m.
         velocity_limit: (J,) rad/s.
         policy_dt: period of the policy in training, s.
-        physics_dt: physics step in training, s.
+        physics_dt: physics step of evaluations, s; ppo.coarse_physics may have made that of the training longer.
         command_ranges: lowest and highest command in training by name (m/s, m/s, rad/s); empty if there are none.
         conventions: description of frames, quaternions and signs.
         estimator: settings of the state estimator (``deploy.estimation.FilterConfig`` as JSON); empty: those of a Go1.

@@ -23,7 +23,7 @@ from go1exp.evaluate.quantities import (
     Row,
     about,
     by_condition,
-    coarse_physics,
+    coarse_note,
     distinct,
     plain,
     summary,
@@ -90,8 +90,8 @@ def play(
     repeats, played.rows = len(played.rows) - len(rows), rows
     figures = summarised(chosen, rows)
     stage.finished()
-    if coarse := coarse_physics(stage.physics_dt(stage.policy_dt)):
-        played.notes.append(coarse)
+    if note := coarse_note(stage.physics_dt(stage.policy_dt)):
+        played.notes.append(note)
     about_play = {"agent": agent.about, "rates": dataclasses.asdict(rates), "go1exp": __version__, **(origin or {})}
     verdicts = evaluated(protocol.claims, figures)
     return Result(chosen, agent.label, about_play, played, repeats, figures, verdicts, time.monotonic() - began)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,6 @@ from go1exp.evaluate.protocol.kinds.steady import ERRORS, Steady
 from go1exp.evaluate.protocol.plan import Motion
 from go1exp.evaluate.quantities import Column, Row, add_measures
 from go1exp.mdp.measures.trace import Trace, mean_over
-
-if TYPE_CHECKING:
-    pass
 
 SATURATED = 0.99  # share of the peak torque from which on an actuator counts as saturated
 POINTS = 1500  # most dots of one kind of joint in the scatter
