@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from go1exp.base.paths import data_root
-from go1exp.cli.train import _ranges
+from go1exp.cli.tune import _ranges
 from go1exp.config.schema.registry import ConfigError
 from go1exp.train import run_state
 from go1exp.train.early_stop import logged

@@ -20,7 +20,7 @@ import yaml
 
 from go1exp.base.errors import Expected
 from go1exp.base.paths import data_root
-from go1exp.cli.train import _ranges
+from go1exp.cli.tune import _ranges
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError
 from go1exp.sim.task import parse_train
@@ -32,7 +32,7 @@ from tests.command import environment
 from tests.command import run as cli
 from tests.small_run import SMALL
 
-ABOUT = ("go1exp/train/sweep/", "go1exp/cli/train.py", "conf/tune.yaml")
+ABOUT = ("go1exp/train/sweep/", "go1exp/cli/tune.py", "conf/tune.yaml")
 NEEDS_OPTUNA = pytest.mark.skipif(
     importlib.util.find_spec("optuna") is None and not os.environ.get("GO1EXP_TEST_TUNE"),
     reason="no optuna: pip install 'go1exp[tune]'",

@@ -11,8 +11,6 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from go1exp.base.errors import REFUSED
 from go1exp.base.paths import data_root
 from go1exp.config.schema.registry import ConfigError, unknown_name
@@ -107,6 +105,8 @@ def remove_empty(folder: Path) -> None:
 
 def long_enough(recordings: list[Recording], least: float) -> list[Recording]:
     """Return the recordings that windows of ``least`` s can be cut from; print which are left out, and why."""
+    import numpy as np
+
     from go1exp.logs.audit.signals import Log
     from go1exp.logs.audit.single import wrong_steps
 
@@ -131,6 +131,8 @@ def read_all(places: str | Sequence[str]) -> list[Recording]:
     Recordings of one name are named after their folders, too (``day1/run_0``), in one folder after their files. Raise
     RecordingError if one is missing or damaged, or given twice, also as a copy.
     """
+    import numpy as np
+
     from go1exp.logs.recording import RecordingError, read
 
     files = files_of(places)

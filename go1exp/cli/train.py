@@ -1,31 +1,26 @@
-"""``go1exp train`` and ``go1exp tune``."""
+"""``go1exp train``."""
 
 from __future__ import annotations
 
-import importlib.util
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from go1exp.base.errors import FAILED, STOPPED
+from go1exp.base.errors import STOPPED
 from go1exp.cli import hydra_main, sweep
-from go1exp.cli.app import App, discard, parse
+from go1exp.cli.app import App, discard
 from go1exp.cli.places import run_folder as existing
 from go1exp.cli.places import shipped_policies
 from go1exp.cli.verbs import command
 from go1exp.config.choices import config_folder
-from go1exp.config.compose import compose_checked, key_values
+from go1exp.config.compose import key_values
 from go1exp.config.hydra_adapter import read_yaml, with_values
 from go1exp.config.schema.registry import ConfigError
-from go1exp.train.sweep.tune import TuneSettings
 
 if TYPE_CHECKING:
     from go1exp.sim.task import TrainConfig
     from go1exp.train.policy import Weights
-    from go1exp.train.sweep.tune import Range
 
 RESUMABLE = (
     *("ppo.iterations", "checkpoint.every", "checkpoint.keep", "torch_threads", "device", "devices", "backend"),
@@ -258,66 +253,3 @@ def _train(job: TrainJob, first: Weights | None) -> int | None:
 RULES = sweep.Rules(resolved, check, plan, _planned, _go_on)
 
 APP = App("train", _task, sweep=partial(sweep.begin, RULES))
-
-
-FORMS = "key=interval(low,high), key=tag(log,interval(low,high)), key=range(first,end) or key=choice(a,b)"
-
-
-def _ranges(space: Sequence[str]) -> dict[str, Range]:
-    """Return what each key is drawn from; raise ConfigError with every entry that is no range of a key."""
-    from go1exp.train.sweep.tune import Range
-
-    ranges: dict[str, Range] = {}
-    problems = []
-    for text in space:
-        try:
-            key, bounds = hydra_main.sweep_range(text)
-            drawn = Range(**bounds)
-            if reason := _empty(drawn):
-                problems.append(f"space: {text!r}: {reason}")
-            ranges[key] = drawn
-        except (ValueError, TypeError):
-            problems.append(f"space: {text!r} is none of {FORMS}")
-    if problems or not ranges:
-        raise ConfigError(problems or [f"space: is empty; give entries such as {FORMS}"])
-    return ranges
-
-
-def _empty(drawn: Range) -> str | None:
-    """Return why nothing can be drawn from a range, which Optuna would refuse at the first trial; None if it can."""
-    if drawn.choices:
-        return None
-    if not -math.inf < drawn.low <= drawn.high < math.inf:
-        return "is empty; its second number must be the larger one, and both finite"
-    return "a logarithm needs numbers above 0" if drawn.log and drawn.low <= 0 else None
-
-
-def _tune(container: dict[str, Any]) -> int | None:
-    settings = parse(TuneSettings, container)
-    ranges = _ranges(settings.space)
-    if importlib.util.find_spec("optuna") is None:
-        raise ConfigError(["go1exp tune needs the package optuna: pip install 'go1exp[tune]'"])
-
-    from go1exp.config.schema.training import EVALUATED
-    from go1exp.train.sweep.tune import Search
-
-    def planned(overrides: Sequence[str], run: Path) -> None:
-        job = resolved(compose_checked("train", overrides), list(overrides), run)
-        check(job)
-        plan(job)
-
-    lowest = [f"{key}={drawn.example}" for key, drawn in ranges.items()]
-    job = resolved(compose_checked("train", [*settings.overrides, *lowest]), lowest, Path(settings.out))
-    if settings.metric.startswith(EVALUATED) and not job.config.eval.every:
-        raise ConfigError([f"metric = {settings.metric!r}: needs evaluations; add eval.every=50 to overrides"])
-    check(job)
-    best = Search(settings, ranges, planned).run()
-    if best is None:
-        return FAILED
-    drawn = [f"{key}={value}" for key, value in best.params.items()]
-    print(f"best: trial {best.number}, {settings.metric} = {best.value:.5g}")
-    print(f"now: {command('train', *settings.overrides, *drawn)}")
-    return None
-
-
-TUNE = App("tune", _tune, TuneSettings)

@@ -31,7 +31,6 @@ MODULES = {
     "fit-actuator": "fit_actuator",
     "list": "helptext",
     "sim": "play_web",
-    "tune": "train",
     "record_audit": "record",
     "record_import": "record",
     "export_check": "export",
