@@ -23,6 +23,7 @@ from go1exp.cli.deploy import DeploySettings
 from go1exp.cli.helptext import leaves
 from go1exp.cli.hydra_main import choices_from_files
 from go1exp.cli.subjects import ROBOT_GROUPS
+from go1exp.cli.verbs import parted
 from go1exp.config.compose import compose
 from go1exp.config.schema import registry
 from go1exp.config.schema.registry import ConfigError
@@ -636,3 +637,13 @@ def test_play_writes_a_clip_and_a_picture(run: Path, tmp_path: Path) -> None:
     assert 4 <= len(frames) <= 5
     assert iio.imread(tmp_path / "clip.png").std() > 1.0
     assert {p.name for p in tmp_path.iterdir()} == {"clip.mp4", "clip.png"}
+
+
+def test_a_folder_that_looks_like_a_setting_is_one_if_its_name_can_be_no_key(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("sp ace=x", "runs/seed=1", "seed=1"):
+        Path(name).mkdir(parents=True)
+    given = ["sp ace=x", "runs/seed=1", "./seed=1", "seed=1", "reward=paper", "hydra/launcher=joblib", "no such=x"]
+    assert parted(given) == ([], ["seed=1", "reward=paper", "hydra/launcher=joblib", "no such=x"], given[:3])

@@ -95,9 +95,16 @@ def parted(arguments: Sequence[str]) -> tuple[list[str], list[str], list[str]]:
     words: list[str] = []
     for before, word in zip(["", *arguments], arguments, strict=False):
         is_option = word.startswith("-") or before in VALUED
-        is_override = "=" in word or word.startswith("~")
+        is_override = word.startswith("~") or ("=" in word and not _is_file(word))
         (options if is_option else overrides if is_override else words).append(word)
     return options, overrides, words
+
+
+def _is_file(word: str) -> bool:
+    """Return whether a word with ``=`` is a file or folder, and no setting: ``seed=1`` is one, ``./seed=1`` is not."""
+    key = word.partition("=")[0]
+    is_key = re.fullmatch(r"\+{0,2}[a-zA-Z_][\w./@:-]*", key) and not ("/" in key and Path(key).parent.is_dir())
+    return not is_key and Path(word).exists()
 
 
 def quoted(text: str) -> str:
