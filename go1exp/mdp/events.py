@@ -27,6 +27,7 @@ class Push(Memory):
     """Now and then the trunk's horizontal velocity is set to a random value (paper, section II-B.1).
 
     The paper sets the velocity where its peers add to it; it does not say for which axes: x and y of the world here.
+    A wait goes on from one episode to the next, so that episodes shorter than it have pushes, too.
     """
 
     memory = ("time_left",)
@@ -39,14 +40,15 @@ class Push(Memory):
         self.time_left = torch.zeros(len(stream.key), device=stream.key.device)
 
     def advance(self, state: KinematicState, dt: float, restart: Tensor) -> None:
-        """Let ``dt`` s pass, push where it is time, and start a new wait there and where ``restart`` (N,) is set."""
+        """Let ``dt`` s pass; push where it is time, but not where an episode begins (``restart``, (N,))."""
         self.time_left -= dt
-        due = (self.time_left <= 1e-6) & ~restart
+        over = self.time_left <= 1e-6
+        due = over & ~restart
         velocity = self._stream.uniform(2, low=self._velocity[0], high=self._velocity[1])
         live = state.base_lin_vel_w[:, :2]
         live.copy_(torch.where(due.unsqueeze(1), velocity.to(live.dtype), live))
         wait = self._stream.uniform(1, low=self._interval[0], high=self._interval[1]).squeeze(1)
-        self.time_left.copy_(torch.where(due | restart, wait, self.time_left))
+        self.time_left.copy_(torch.where(over, wait, self.time_left))
 
 
 @termination("trunk_contact")

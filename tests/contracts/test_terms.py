@@ -423,12 +423,12 @@ def test_a_push_sets_the_horizontal_velocity_every_ten_to_fifteen_seconds() -> N
     assert waits.mean() == pytest.approx(12.5 + dt / 2, abs=0.3)
 
 
-def test_a_restart_begins_a_new_wait_for_a_push() -> None:
-    push, state = members("event")["push"].target(stream(2), interval=(1.0, 1.0)), start_states(2)
-    push.advance(state, 0.1, everyone(2))
-    for k in range(1, 15):
-        push.advance(state, 0.1, torch.tensor([False, k == 5]))
+def test_a_wait_for_a_push_goes_on_in_the_next_episode_and_no_push_meets_its_first_step() -> None:
+    push, state = members("event")["push"].target(stream(3), interval=(1.0, 1.0)), start_states(3)
+    push.advance(state, 0.1, everyone(3))
+    for k in range(1, 20):
+        push.advance(state, 0.1, torch.tensor([False, k == 5, k == 10]))
         pushed = (state.base_lin_vel_w[:, :2] != 0.0).all(1).tolist()
-        assert pushed == [k >= 10, False]
-    push.advance(state, 0.1, ~everyone(2))
+        assert pushed == [k >= 10, k >= 10, False]
+    push.advance(state, 0.1, ~everyone(3))
     assert (state.base_lin_vel_w[:, :2] != 0.0).all()
