@@ -50,6 +50,10 @@ class Push(Memory):
         wait = self._stream.uniform(1, low=self._interval[0], high=self._interval[1]).squeeze(1)
         self.time_left.copy_(torch.where(over, wait, self.time_left))
 
+    def renew(self) -> None:
+        """Forget the waits."""
+        self.time_left.zero_()
+
 
 @termination("trunk_contact")
 def trunk_contact(s: Snapshot) -> Tensor:
