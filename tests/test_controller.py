@@ -22,7 +22,7 @@ from go1exp.cli.helptext import leaves
 from go1exp.config.schema.registry import ConfigError
 from go1exp.evaluate.controller import forces, gait
 from go1exp.evaluate.controller.batch import Driven
-from go1exp.evaluate.controller.forces import Body, ForcePlan, Problem
+from go1exp.evaluate.controller.forces import ForcePlan, Problem
 from go1exp.evaluate.controller.gait import Clock, Feet
 from go1exp.evaluate.controller.mpc import Mpc
 from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
@@ -57,7 +57,7 @@ def settings(**changes: Any) -> MpcSettings:
     return parsed
 
 
-BODY = Body(12.743, np.diag([0.127, 0.394, 0.423]))
+BODY = (12.743, np.diag([0.127, 0.394, 0.423]))  # mass, kg, and inertia, kg m2
 HIPS = np.column_stack([gait.HIPS, np.zeros(4)])
 
 
@@ -79,7 +79,7 @@ def problem(seed: int | None = None, steps: int = 10, slope: tuple[float, float]
 
 @pytest.fixture(scope="module")
 def plan() -> ForcePlan:
-    return ForcePlan(settings().force, BODY)
+    return ForcePlan(settings().force, *BODY)
 
 
 # ---------------------------------------------------------------------- forces
@@ -147,7 +147,7 @@ def test_the_programme_is_the_cost_of_its_own_prediction(plan: ForcePlan, seed: 
 @pytest.mark.parametrize("seed", [3, 4])
 def test_the_solution_is_scipys(seed: int) -> None:
     small = dataclasses.replace(settings().force, steps=4, effort=1e-4)
-    plan, asked = ForcePlan(small, BODY), problem(seed, steps=4)
+    plan, asked = ForcePlan(small, *BODY), problem(seed, steps=4)
     H, g, A, upper, lower = plan.programme(asked)
     n = len(g)
     scale = 100.0  # of forces, N: for the search's sake
@@ -178,7 +178,7 @@ def test_a_missing_solver_is_one_line_that_names_the_extra(monkeypatch: pytest.M
 
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(forces.SolverError, match=r"^controller=mpc: needs daqp.*go1exp\[mpc\]'$"):
-        ForcePlan(settings().force, BODY)
+        ForcePlan(settings().force, *BODY)
 
 
 # ---------------------------------------------------------------------- gait, feet, ground, swing, kinematics

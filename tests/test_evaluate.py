@@ -329,21 +329,12 @@ def test_the_table_says_that_physics_was_coarse() -> None:
     assert "softens" not in table.text({**REPORT, "physics_dt": 0.002})
 
 
-def test_the_table_for_a_document_is_markdown() -> None:
-    lines = table.markdown(REPORT).split("\n")
-    assert [line.count("|") for line in lines[:4]] == [6, 6, 6, 6]
-    cells = [tuple(c.strip() for c in line.strip("|").split("|")) for line in lines[:4]]
-    assert cells == [table.HEADER, ("---",) * 5, *CELLS]
-    assert lines[4] == ""
-
-
-@pytest.mark.parametrize("lay_out", [table.text, table.markdown])
-def test_a_table_ends_with_what_it_is_of(lay_out: Callable[[dict[str, Any]], str]) -> None:
-    last = lay_out(REPORT).split("\n")[-1]
+def test_a_table_ends_with_what_it_is_of() -> None:
+    last = table.text(REPORT).split("\n")[-1]
     for part in ("2.50 M steps", "x 0.050, y 0.123, yaw 1.000", "falls 17 in 32 episodes of 20 s", "noise, push"):
         assert part in last
     quiet = {**REPORT, "rmse": None, "settings": {**REPORT["settings"], "noise": False, "push": False}}
-    assert "no noise, randomisation or pushes, on flat ground" in lay_out(quiet)
+    assert "no noise, randomisation or pushes, on flat ground" in table.text(quiet)
 
 
 # ---------------------------------------------------------------------- policies from run folders

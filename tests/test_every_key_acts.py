@@ -1042,7 +1042,7 @@ def bench_trace(container: dict[str, Any], walk: Walk) -> Trace:
         patch.setattr(env, "time", types.SimpleNamespace(perf_counter=lambda: 0.04 * next(ticks)))
         patch.setattr(mujoco_cpu, "Batch", batch)
         patch.setattr(env, "Batch", batch)
-        patch.setattr(env, "subproc_subject", lambda task: (env.Subject("processes", lambda: 1), lambda: None))
+        patch.setattr(env, "subproc_subject", lambda task: (lambda: 1, lambda: None))
         patch.setattr(env, "memory_per_env_kb", memory)
         said, files = outcome("bench", container, walk)
     yield "built", built

@@ -140,7 +140,7 @@ def test_a_subject_is_not_told_apart_from_itself(name: str, result: Callable[[st
     one = result(name)
     again = dataclasses.replace(one, label="again")
     differences = comparing.compared(one, again)
-    assert {d.word for d in differences} == {"no significant difference"}
+    assert {d.verdict for d in differences} == {"no significant difference"}
     assert all(d.difference.estimate == 0.0 or math.isnan(d.difference.estimate) for d in differences)
     assert "no significant difference" in comparison({name: [one, again]}, {name: differences}, {})
 
@@ -172,9 +172,9 @@ def test_a_better_subject_is_called_better_and_a_worse_one_worse(result: Callabl
         if row[ROBOT] < 99
     ]
     other = dataclasses.replace(one, label="other", played=dataclasses.replace(one.played, rows=rows[:-1]))
-    found = {(d.quantity, tuple(d.condition.values())): d for d in comparing.compared(one, other)}
+    found = {(d.figure, tuple(d.condition.values())): d for d in comparing.compared(one, other)}
     d = found["rmse_x", (0.5, 0.0, 0.0)]
-    assert (d.word, d.difference.n) == ("better", 3)
+    assert (d.verdict, d.difference.n) == ("better", 3)
     assert d.difference.estimate == pytest.approx(-0.1, abs=1e-3)
     assert found["rmse_x", (1.0, 0.0, 0.0)].difference.n == 2
     assert found["rmse_x", (1.0, 0.0, 0.0)].word == "no significant difference"

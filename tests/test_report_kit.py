@@ -8,7 +8,7 @@ import pytest
 
 from go1exp.base.report.page import Block, Card, Page, Section, render
 from go1exp.base.report.plots import Drawing, listing
-from go1exp.base.report.table import Cell, Table, aligned, interval_text, markdown, number, share, verdict
+from go1exp.base.report.table import Cell, Table, aligned, interval_text, number, share, verdict
 
 
 @pytest.mark.parametrize(
@@ -33,7 +33,6 @@ def test_intervals_and_shares() -> None:
 def test_text_tables_have_columns() -> None:
     rows = [("a", "bb", "1"), ("ccc", "d", "22")]
     assert aligned(rows, left=2, indent=" ") == [" a    bb   1", " ccc  d   22"]
-    assert markdown(("x", "y"), [("1", "2")]) == ["| x | y |", "| --- | --- |", "| 1 | 2 |"]
 
 
 def test_a_page_has_every_part_and_escapes_names() -> None:

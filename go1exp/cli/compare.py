@@ -140,12 +140,12 @@ def lines(differences: dict[str, Any]) -> list[str]:
     for key, those in differences.items():
         for subject in dict.fromkeys(d.subject for d in those):
             of_subject = [d for d in those if d.subject == subject]
-            clear = [d for d in of_subject if d.word != "no significant difference"]
+            clear = [d for d in of_subject if d.verdict != "no significant difference"]
             text_lines.append(f"{key}: {subject}: {len(clear)} of {len(of_subject)} differences are significant")
             for d in clear:
                 change = interval_text(d.difference.estimate, d.difference.low, d.difference.high)
                 where = condition_text(d.condition)
-                text_lines.append(f"  {d.word:7} {d.quantity} {d.first:.3g} -> {d.other:.3g}, {change} ({where})")
+                text_lines.append(f"  {d.verdict:7} {d.figure} {d.first:.3g} -> {d.other:.3g}, {change} ({where})")
     return text_lines
 
 

@@ -232,5 +232,4 @@ class ControllerAgent(Agent):
         return Driven(core, self.make, noise=core.noise, seed=seed, trunk_velocity=trunk_velocity)
 
 
-Progress = Callable[[int, int], None]
-"""Called with what is done and all that there is to do."""
+Progress = Callable[[int, int], None]  # called with what is done and all that there is to do

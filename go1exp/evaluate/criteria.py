@@ -7,8 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-Row = dict[str, Any]
-"""One command of a report of ``rollout.evaluate``."""
+Row = dict[str, Any]  # one command of a report of ``rollout.evaluate``
 
 
 def _forward(low: float, high: float) -> Callable[[Row], bool]:
@@ -29,10 +28,6 @@ def _slow(row: Row) -> bool:
     """Return whether one axis alone is commanded between 0.1 and 0.3, m/s or rad/s."""
     commanded = [abs(v) for v in row["command"] if v]
     return len(commanded) == 1 and 0.1 <= commanded[0] <= 0.3
-
-
-def _up_to(speed: float) -> Callable[[Row], bool]:
-    return lambda row: math.hypot(*row["command"][:2]) <= speed
 
 
 def _measure(name: str) -> Callable[[Row], list[float | None]]:
@@ -88,7 +83,7 @@ CRITERIA = (
     Criterion("touchdown speed", _forward(1.0, 1.0), _measure("touchdown_speed_p95"), high=1.0),
     Criterion("peak force", _forward(1.0, 1.0), _measure("peak_force_p95"), high=2.5),
     Criterion("slip", _moving, _measure("slip_share_all"), high=0.08),
-    Criterion("RMSE xy", _up_to(1.5), _rmse("x", "y"), high=0.08),
+    Criterion("RMSE xy", lambda row: math.hypot(*row["command"][:2]) <= 1.5, _rmse("x", "y"), high=0.08),
     Criterion("RMSE yaw", lambda row: True, _rmse("yaw"), high=0.10),
     Criterion("commanded 2.0 m/s", _forward(2.0, 2.0), _answer, low=0.95),
     Criterion("commanded 1.8 rad/s", _alone(2, 1.8), _answer, low=0.95),

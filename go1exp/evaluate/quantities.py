@@ -27,9 +27,8 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 Condition = tuple[Any, ...]
 
-ROBOT = "robot"
-"""Column with the robot's number in its condition: the same number is the same robot in all conditions' draws."""
-
+AXES = ("x", "y", "yaw")  # of a command, and its columns: m/s, m/s, rad/s
+ROBOT = "robot"  # column with the robot's number: the same number is the same robot in all conditions' draws
 FINGERPRINT = "fingerprint"  # column with a number that two robots share only if they did the same, bit for bit
 DIGITS = 6  # significant digits in the file
 
@@ -71,14 +70,10 @@ def distinct(rows: Iterable[Row], keys: Sequence[str], random: bool) -> list[Row
 
     Where nothing is random all did the same, whatever the last bits of a batched matrix product say.
     """
-    known_marks: set[Any] = set()
-    kept = []
+    first: dict[Condition, Row] = {}
     for row in rows:
-        what = (*(row[k] for k in keys), row[FINGERPRINT] if random else None)
-        if what not in known_marks:
-            known_marks.add(what)
-            kept.append(row)
-    return kept
+        first.setdefault((*(row[k] for k in keys), row[FINGERPRINT] if random else None), row)
+    return list(first.values())
 
 
 def about(rows: Iterable[Row], condition: Mapping[str, Any]) -> list[Row]:
@@ -114,10 +109,8 @@ def summary(rows: Sequence[Row], keys: Sequence[str], columns: Sequence[Column])
     for condition, those in by_condition(rows, keys).items():
         figures = {c.name: plain(figure(those, c), c.unit) for c in columns if any(c.name in row for row in those)}
         if FELL.name in figures and MOVING.name in figures:
-            minutes = float(np.nansum(values(those, MOVING.name))) / 60.0
-            figures["falls_per_minute"] = plain(
-                rate_interval(int(np.nansum(values(those, FELL.name))), minutes), "1/min"
-            )
+            fell, moving_s = (float(np.nansum(values(those, column.name))) for column in (FELL, MOVING))
+            figures["falls_per_minute"] = plain(rate_interval(int(fell), moving_s / 60.0), "1/min")
         entries.append({"condition": dict(zip(keys, condition, strict=True)), "n": len(those), "figures": figures})
     return entries
 
@@ -128,8 +121,6 @@ def plain(interval: Interval, unit: str) -> dict[str, Any]:
     rounded = {k: float(f"{v:.{DIGITS}g}") if math.isfinite(v) else None for k, v in numbers.items()}
     return {**rounded, "n": interval.n, "unit": unit}
 
-
-# ---------------------------------------------------------------------- measures of gait and contact as columns
 
 BETTER: dict[str, Literal["lower", "higher"]] = {
     **dict.fromkeys(("trot_error", "touchdown_speed_p95", "peak_force_p95", "slip_share_all", "slip_share"), "lower"),
@@ -160,15 +151,9 @@ def add_measures(rows: Sequence[Row], measures: Mapping[str, Any], legs: Sequenc
         if each is None or each.dtype.kind == "U":
             continue
         for row, value in zip(rows, each, strict=True):
-            parts = (
-                {name: value}
-                if np.ndim(value) == 0
-                else {f"{name}_{leg}": v for leg, v in zip(legs, value, strict=True)}
-            )
+            of_legs = np.ndim(value) > 0
+            parts = {f"{name}_{leg}": v for leg, v in zip(legs, value, strict=True)} if of_legs else {name: value}
             row |= {k: float(v) if np.isfinite(v) else None for k, v in parts.items()}
-
-
-# ---------------------------------------------------------------------- measures of a command of a grid
 
 
 def described(terms: Sequence[Term], trace: Trace) -> dict[str, Any]:
@@ -200,7 +185,7 @@ def share(count: int, n: int) -> dict[str, Any]:
 
 def _named(interval: Interval, name: str) -> dict[str, Any]:
     figure = plain(interval, "")
-    return {name: figure["estimate"], "low": figure["low"], "high": figure["high"], "n": figure["n"]}
+    return {name: figure["estimate"], **{key: figure[key] for key in ("low", "high", "n")}}
 
 
 DRAW = "draw."  # first part of the name of a column with something that was drawn for the robot
@@ -212,10 +197,7 @@ ERRORS = (
     Column("error_yaw", "rad/s", "root mean square error of the yaw rate", better="lower"),
 )
 
-COLUMNS = (FELL, MOVING, *ERRORS)
-"""Figures of a row beside its measures."""
-
-KEYS = ("x", "y", "yaw")  # columns that say the command: m/s, m/s, rad/s
+COLUMNS = (FELL, MOVING, *ERRORS)  # figures of a row beside its measures
 SEPARATE = 3  # a draw of more numbers than these stands as their mean and their range
 
 
@@ -243,7 +225,7 @@ def rows_of(
     figures = np.column_stack([planar, errors])
     rows: list[dict[str, Any]] = [
         {
-            **dict(zip(KEYS, map(float, commands[i]), strict=True)),
+            **dict(zip(AXES, map(float, commands[i]), strict=True)),
             ROBOT: i % episodes,
             FELL.name: bool(fell[i]),
             MOVING.name: round(float(moving_s[i]), 4),
@@ -292,8 +274,6 @@ def _columns(name: str, values: NDArray[np.float64]) -> dict[str, NDArray[np.flo
         return {f"{name}_{part}": varying[:, k] for k, part in enumerate(parts)}
     return {f"{name}_mean": varying.mean(1), f"{name}_range": np.ptp(varying, axis=1)}
 
-
-# ---------------------------------------------------------------------- files
 
 FILE = "eval.json"  # in a run folder; the rows are beside it
 

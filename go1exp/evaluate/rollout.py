@@ -15,8 +15,8 @@ from go1exp.base.wording import counted
 from go1exp.config.schema.physics import BackendConfig, CpuBackend
 from go1exp.config.schema.registry import ConfigError, Term, TooLongError, members
 from go1exp.evaluate.agents import Agent, ControllerAgent, PolicyAgent
-from go1exp.evaluate.controller.types import Controller, TrunkVelocity
-from go1exp.evaluate.quantities import described, drawn, rows_of, share
+from go1exp.evaluate.controller.types import Command, Controller, TrunkVelocity
+from go1exp.evaluate.quantities import AXES, described, drawn, rows_of, share
 from go1exp.evaluate.recorder import Recorder, bytes_per_second
 from go1exp.mdp.commands import FixedVelocity
 from go1exp.mdp.measures import measured
@@ -27,11 +27,6 @@ from go1exp.sim.physics.scene import build_model
 from go1exp.sim.task import TaskConfig, time_rules
 from go1exp.sim.terrain import TerrainConfig, build_terrain
 from go1exp.train.policy import Policy
-
-Command = tuple[float, float, float]
-"""Commanded velocity: x, y in m/s, yaw rate in rad/s, body frame."""
-
-AXES = ("x", "y", "yaw")
 
 
 @dataclass(frozen=True)
@@ -277,8 +272,6 @@ def grid(x: Sequence[float], y: Sequence[float], yaw: Sequence[float], cross: bo
 def _per_axis(values: torch.Tensor) -> dict[str, float]:
     return {axis: round(float(v), 5) for axis, v in zip(AXES, values, strict=True)}
 
-
-# ---------------------------------------------------------------------- the delay margin
 
 DELAYS_MS = (10, 20, 30, 40)  # further delays of commands that are tried, ms
 DELAY = "command_delay"  # effect that delays commands

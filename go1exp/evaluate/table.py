@@ -6,20 +6,14 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import go1exp.base.report.table as kit
 from go1exp.base.report.table import aligned
 from go1exp.evaluate.criteria import Verdict, evaluated
-from go1exp.evaluate.quantities import coarse_note
-from go1exp.evaluate.rollout import AXES
+from go1exp.evaluate.quantities import AXES, coarse_note
 
 HEADER = ("command x, y, yaw", "mean x, y, yaw", "RMSE x, y, yaw", "falls", "mean time s")
 
-Show = Callable[[Any], str]
-"""Text of one cell from the entry of a measure in a report, which may be None."""
-
-Columns = dict[str, tuple[str, Show]]
-"""Header -> measure and its format."""
-
+Show = Callable[[Any], str]  # text of one cell from the entry of a measure in a report, which may be None
+Columns = dict[str, tuple[str, Show]]  # header -> measure and its format
 NO_FIGURE = "-"
 FEET = "FR FL RR RL"
 WIDTH = 120  # largest width of a table of further measures, in characters
@@ -217,8 +211,3 @@ def text(report: dict[str, Any]) -> str:
         line(report) for key, line in (("distinct_falls", _falls), ("delay_margin", _delay)) if key in report
     ]
     return "\n".join([*lines, *(acceptance(report) if measured else ()), _summary(report)])
-
-
-def markdown(report: dict[str, Any]) -> str:
-    """Return the report as a Markdown table."""
-    return "\n".join([*kit.markdown(HEADER, rows(report)), "", _summary(report)])

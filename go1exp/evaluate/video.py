@@ -25,18 +25,8 @@ from go1exp.base.files import replacing
 from go1exp.evaluate.footfalls import Footfalls, font
 from go1exp.evaluate.rollout import planar_velocity
 from go1exp.mdp.commands import FixedVelocity
-from go1exp.sim.env.camera import (
-    AZIMUTH,
-    COMMAND_RGB,
-    DISTANCE,
-    ELEVATION,
-    MEASURED_RGB,
-    Camera,
-    Picture,
-    RenderingUnavailable,
-    Stage,
-    draw_velocities,
-)
+from go1exp.sim.env import camera as view
+from go1exp.sim.env.camera import Camera, Picture, RenderingUnavailable, Stage, draw_velocities
 from go1exp.sim.env.core import Go1Core
 from go1exp.train.policy import Policy
 
@@ -197,7 +187,7 @@ def _write_caption(picture: Picture, seconds: float, command: Sequence[float], m
     band[:] = (0.35 * band).astype(np.uint8)
     image = Image.fromarray(picture)
     draw = ImageDraw.Draw(image)
-    rows = (("command ", command, COMMAND_RGB), ("measured", measured, MEASURED_RGB))
+    rows = (("command ", command, view.COMMAND_RGB), ("measured", measured, view.MEASURED_RGB))
     for k, (name, (x, y, yaw), rgb) in enumerate(rows):
         text = f"{name} {x:+5.2f} {y:+5.2f} m/s {yaw:+5.2f} rad/s"
         prefix = f"{seconds:5.1f} s  "
@@ -208,8 +198,6 @@ def _write_caption(picture: Picture, seconds: float, command: Sequence[float], m
         draw.text((left + letters.getlength(prefix), top), text, tuple(round(255 * c) for c in rgb), letters)
     picture[:] = np.asarray(image)
 
-
-# ---------------------------------------------------------------------- live
 
 STEERING = {
     265: (0, 0.1),  # up: faster forward
@@ -241,7 +229,11 @@ def live(core: Go1Core, policy: Policy, env: int = 0) -> None:
         core.command = FixedVelocity(core.random.stream("command"))
         core.command.value[:] = torch.tensor(command)
         observation = core.reset()
-        window.cam.azimuth, window.cam.elevation, window.cam.distance = AZIMUTH, ELEVATION, 1.3 * DISTANCE
+        window.cam.azimuth, window.cam.elevation, window.cam.distance = (
+            view.AZIMUTH,
+            view.ELEVATION,
+            1.3 * view.DISTANCE,
+        )
         due = time.perf_counter()
         while window.is_running():
             core.command.value[:] = torch.tensor(command)
@@ -290,9 +282,6 @@ def _window(stage: Stage, on_key: Callable[[int], None]) -> Iterator[Any]:
     finally:  # the interpreter would hang if it ended before the threads of the window
         for thread in set(threading.enumerate()) - others:
             thread.join(5.0)
-
-
-# ---------------------------------------------------------------------- without any graphics library
 
 
 def poses_of(core: Go1Core, policy: Policy, seconds: float, count: int = 8) -> list[np.ndarray]:

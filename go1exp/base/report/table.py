@@ -1,4 +1,4 @@
-"""Tables of all reports as text, Markdown and cells of a page, and the numbers in them."""
+"""Tables of all reports as text and cells of a page, and the numbers in them."""
 
 from __future__ import annotations
 
@@ -111,8 +111,3 @@ def aligned(rows: Sequence[Sequence[str]], left: int, indent: str = "") -> list[
         padded += [cell.rjust(w) for cell, w in zip(row[left:], widths[left:], strict=True)]
         lines.append(indent + "  ".join(padded).rstrip())
     return lines
-
-
-def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return the lines of a Markdown table."""
-    return [f"| {' | '.join(row)} |" for row in (header, ["---"] * len(header), *rows)]

@@ -22,16 +22,8 @@ import numpy as np
 import torch
 
 from go1exp.deploy.export.build import build
+from go1exp.deploy.runtime import go1_wire as wire
 from go1exp.deploy.runtime.bundle import Bundle, loads
-from go1exp.deploy.runtime.go1_wire import (
-    Health,
-    pack_command,
-    pack_state,
-    state_refusal,
-    tick_of,
-    unpack_command,
-    unpack_state,
-)
 from go1exp.deploy.runtime.launch import RobotError, SimulatedRobot
 from go1exp.deploy.runtime.loop import run as loop
 from go1exp.evaluate.bench.env import Measured
@@ -86,15 +78,15 @@ def _packets() -> float:
     quat = np.array([1.0, 0.0, 0.0, 0.0])
     q, qd, torque = (rng.normal(size=JOINTS) for _ in range(3))
     state = LowState(0.0, q, qd, torque, quat, np.zeros(3), np.zeros(3), np.full(4, 30.0))
-    health, rpy = Health(), np.zeros(3)
-    packet = pack_state(state, 2, health, rpy)
+    health, rpy = wire.Health(), np.zeros(3)
+    packet = wire.pack_state(state, 2, health, rpy)
 
     def both_ends() -> None:
-        unpack_command(pack_command(command))
-        pack_state(state, 2, health, rpy)
-        if state_refusal(packet) is None:
-            tick_of(packet)
-            unpack_state(packet, 0.0, 0.0)
+        wire.unpack_command(wire.pack_command(command))
+        wire.pack_state(state, 2, health, rpy)
+        if wire.state_refusal(packet) is None:
+            wire.tick_of(packet)
+            wire.unpack_state(packet, 0.0, 0.0)
 
     return _median_us(both_ends)
 

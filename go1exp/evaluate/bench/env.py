@@ -35,13 +35,7 @@ from go1exp.sim.terrain import build_terrain
 from go1exp.train import trainer
 from go1exp.train.ppo import AdaptivePPO
 
-
-@dataclass(frozen=True)
-class Subject:
-    """A piece of work to measure: ``work()`` does one unit and returns its number of environment steps."""
-
-    label: str
-    work: Callable[[], int]
+Subject = Callable[[], int]  # a piece of work to measure: does one unit and returns its number of environment steps
 
 
 @dataclass(frozen=True)
@@ -56,15 +50,15 @@ class Measured:
 
 def rates(subjects: Mapping[str, Subject], much: Measured) -> dict[str, list[float]]:
     """Return the steps per second of each subject in each round; a warm-up unit of each does not count."""
-    for subject in subjects.values():
-        subject.work()
+    for work in subjects.values():
+        work()
     measured: dict[str, list[float]] = {name: [] for name in subjects}
     for k in range(much.rounds):
-        for name, subject in subjects.items():
+        for name, work in subjects.items():
             steps, start = 0, time.perf_counter()
             # Whole units only: the time is taken after the last one.
             while (elapsed := time.perf_counter() - start) < much.seconds:
-                steps += subject.work()
+                steps += work()
             measured[name].append(steps / elapsed)
         much.on_round(k + 1, much.rounds)
     return measured
@@ -91,8 +85,8 @@ def machine() -> str:
     return f"{cpu}, {os.cpu_count()} cores, mujoco {version('mujoco-core')}, torch {torch.__version__}"
 
 
-ACTION_SCALE = 0.5
-"""Standard deviation of the random actions, policy units (chosen: robots move their feet and few fall)."""
+ACTION_SCALE = 0.5  # standard deviation of random actions, policy units (chosen: robots move their feet and few fall)
+MANY = 2048  # environments of the larger batch whose memory is measured
 
 
 def core_subject(task: TaskConfig, num_envs: int) -> Subject:
@@ -105,7 +99,7 @@ def core_subject(task: TaskConfig, num_envs: int) -> Subject:
         core.step(ACTION_SCALE * torch.randn(num_envs, robot.NUM_JOINTS, generator=generator))
         return num_envs
 
-    return Subject("environment", work)
+    return work
 
 
 def bare_subject(task: TaskConfig, num_envs: int) -> Subject:
@@ -133,7 +127,7 @@ def bare_subject(task: TaskConfig, num_envs: int) -> Subject:
         batch.step(nstep=task.sim.decimation)
         return num_envs
 
-    return Subject("bare mujoco.batch", work)
+    return work
 
 
 def _one_env(task: TaskConfig, index: int) -> Go1Env:
@@ -156,7 +150,7 @@ def subproc_subject(task: TaskConfig) -> tuple[Subject, Callable[[], None]]:
         vec.step((ACTION_SCALE * rng.normal(size=(count, robot.NUM_JOINTS))).astype(np.float32))
         return count
 
-    return Subject(f"SubprocVecEnv of {count} Go1Env", work), vec.close
+    return work, vec.close
 
 
 _MEMORY_PROBE = """
@@ -174,7 +168,7 @@ def resident_kb_after_steps(num_envs: int, overrides: list[str]) -> int:
     from go1exp.config.compose import compose
     from go1exp.sim.task import parse_task
 
-    work = core_subject(parse_task(compose("train", overrides)), num_envs).work
+    work = core_subject(parse_task(compose("train", overrides)), num_envs)
     for _ in range(3):
         work()
     try:
@@ -184,14 +178,14 @@ def resident_kb_after_steps(num_envs: int, overrides: list[str]) -> int:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
-def memory_per_env_kb(overrides: list[str], few: int = 1, many: int = 2048) -> float:
+def memory_per_env_kb(overrides: list[str]) -> float:
     """Return peak memory per environment beyond the first, kB, from two fresh processes."""
 
     def peak(num_envs: int) -> int:
         command = [sys.executable, "-c", _MEMORY_PROBE, str(num_envs), *overrides]
         return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
-    return (peak(many) - peak(few)) / (many - few)
+    return (peak(MANY) - peak(1)) / (MANY - 1)
 
 
 def run(task: TaskConfig, overrides: list[str], much: Measured) -> dict[str, float]:
@@ -210,7 +204,7 @@ def run(task: TaskConfig, overrides: list[str], much: Measured) -> dict[str, flo
     }
 
 
-def learning(ppo: AdaptivePPO, config: TrainConfig, label: str, finish: Callable[[], None] = lambda: None) -> Subject:
+def learning(ppo: AdaptivePPO, config: TrainConfig, finish: Callable[[], None] = lambda: None) -> Subject:
     """Whole iterations: rollout, advantages, update; ``finish`` waits for the device."""
     size = config.ppo.num_envs * config.ppo.steps
 
@@ -219,12 +213,12 @@ def learning(ppo: AdaptivePPO, config: TrainConfig, label: str, finish: Callable
         finish()
         return size
 
-    return Subject(label, work)
+    return work
 
 
 def train(config: TrainConfig, much: Measured) -> dict[str, float]:
     """Measure; return the figures by name."""
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, num_envs=much.num_envs))
-    training = learning(trainer.build(config), config, "training")
-    measured = rates({"train": training, "env": core_subject(config.task, much.num_envs)}, much)
+    subjects = {"train": learning(trainer.build(config), config), "env": core_subject(config.task, much.num_envs)}
+    measured = rates(subjects, much)
     return {**speeds(measured), "train_over_env": ratio(measured, "train", "env")}

@@ -37,7 +37,7 @@ def gpu() -> str:
     return f"{torch.cuda.get_device_name()}, mujoco-warp {mujoco_warp.__version__}, warp {warp.__version__}"
 
 
-def stepped(step: Callable[[torch.Tensor], object], num_envs: int) -> Callable[[], int]:
+def stepped(step: Callable[[torch.Tensor], object], num_envs: int) -> Subject:
     """Return work that makes ``STEPS`` policy steps under random actions and waits for them."""
     generator = torch.Generator("cuda").manual_seed(0)
 
@@ -54,7 +54,7 @@ def env_subject(task: TaskConfig, num_envs: int) -> Subject:
     """The whole environment step under random actions."""
     core = Go1Core(task, num_envs)
     core.reset()
-    return Subject("environment", stepped(core.step, num_envs))
+    return stepped(core.step, num_envs)
 
 
 def bare_subject(task: TaskConfig, num_envs: int) -> Subject:
@@ -90,14 +90,14 @@ def bare_subject(task: TaskConfig, num_envs: int) -> Subject:
         action.copy_(given)
         replay()
 
-    return Subject("bare mujoco-warp", stepped(step, num_envs))
+    return stepped(step, num_envs)
 
 
 def border_subject(config: TrainConfig) -> Subject:
     """Training through SB3's own loop and buffer, with every step in numpy."""
     core = Go1Core(config.task, config.ppo.num_envs, config.process.seed, spread_starts=True, critic=True)
     ppo = AdaptivePPO(config.ppo, Go1VecEnv(core), config.process.seed, "cuda")
-    return learning(ppo, config, "training through numpy")
+    return learning(ppo, config)
 
 
 _FIRST = """
@@ -129,7 +129,7 @@ def run(config: TrainConfig, overrides: list[str], much: Measured) -> dict[str, 
         raise ConfigError(["suite=gpu needs backend=warp on a CUDA device"])
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, num_envs=much.num_envs))
     subjects = {"bare": bare_subject(config.task, much.num_envs), "env": env_subject(config.task, much.num_envs)}
-    training = learning(trainer.build(config), config, "training", torch.cuda.synchronize)
+    training = learning(trainer.build(config), config, torch.cuda.synchronize)
     subjects |= {"train": training, "numpy": border_subject(config)}
     measured = rates(subjects, much)
     cold, warm = first_update_seconds([*overrides, f"ppo.num_envs={much.num_envs}"])

@@ -13,6 +13,7 @@ known numbers times forces: the matrices of the condensed programme need no prod
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -35,14 +36,6 @@ def solver() -> Any:
     except ImportError as error:
         raise SolverError("controller=mpc: needs daqp, which is not installed; pip install 'go1exp[mpc]'") from error
     return daqp
-
-
-@dataclass(frozen=True)
-class Body:
-    """The robot as one rigid body."""
-
-    mass: float  # kg
-    inertia: np.ndarray  # (3, 3) about the centre of mass, trunk frame, kg m2
 
 
 @dataclass(frozen=True)
@@ -79,17 +72,20 @@ MOST_STRUCTURES = 500  # largest number of cached structures; a gait repeats som
 class ForcePlan:
     """Builds and solves the quadratic programme."""
 
-    def __init__(self, settings: ForceSettings, body: Body) -> None:
-        """Compute what does not depend on the state; raise SolverError if the solver is not installed."""
+    def __init__(self, settings: ForceSettings, mass: float, inertia: np.ndarray) -> None:
+        """Compute what does not depend on the state; raise SolverError if the solver is not installed.
+
+        ``mass``, kg, and ``inertia`` (3, 3) about the centre of mass, trunk frame, kg m2, are the robot's as one body.
+        """
         self._solve = solver().solve
-        self.settings, self._body = settings, body
+        self.settings, self._mass = settings, mass
         steps, dt = settings.steps, settings.dt
         after = np.arange(1, steps + 1)[:, None] - np.arange(steps)[None, :]  # ends of intervals, from their starts
         begun = after > 0
         speed, place = dt * begun, dt**2 * (after - 0.5) * begun
         self._speed, self._place = speed, place
-        self._inverse = np.linalg.inv(body.inertia)
-        self._structures: dict[bytes, Structure] = {}
+        self._inverse = np.linalg.inv(inertia)
+        self._structure = lru_cache(MOST_STRUCTURES)(self._structured)
         self._speed_speed, self._place_place = speed.T @ speed, place.T @ place
         self._times = dt * np.arange(1, steps + 1)[:, None]
         weights = settings.weights
@@ -102,15 +98,14 @@ class ForcePlan:
 
         x are the forces of the standing feet in the axes of the ground, interval by interval, foot by foot.
         """
-        settings, body = self.settings, self._body
-        structure = self._structure(problem.stands)
+        settings, structure = self.settings, self._structure(problem.stands.tobytes())
         column_interval, n = structure.column_interval, len(structure.interval)
         rotation = problem.attitude
         inverse = rotation @ self._inverse @ rotation.T
         # Columns: accelerations and angular accelerations of each force component.
         r = problem.arms[structure.interval, structure.foot]
         turn = inverse @ _crossed(r, problem.ground)
-        push = np.tile(problem.ground / body.mass, (1, n))
+        push = np.tile(problem.ground / self._mass, (1, n))
         q_angle, q_place, q_turn, q_speed = self._weights
         free, angles = self._drift(problem)
         H = structure.places * (turn.T @ (q_angle[:, None] * turn) + push.T @ (q_place[:, None] * push))
@@ -134,21 +129,13 @@ class ForcePlan:
 
     def _share(self, problem: Problem, interval: np.ndarray) -> np.ndarray:
         """Return the reference forces (3 n,) of the effort: the weight, shared by the standing feet."""
-        weight = problem.ground.T @ np.array([0.0, 0.0, self._body.mass * GRAVITY])
+        weight = problem.ground.T @ np.array([0.0, 0.0, self._mass * GRAVITY])
         count = problem.stands.sum(1)[interval]
         return np.asarray((weight[None, :] / count[:, None]).ravel())
 
-    def _structure(self, stands: np.ndarray) -> Structure:
-        """Return the structure of a schedule (K, 4), cached."""
-        key = stands.tobytes()
-        if key not in self._structures:
-            if len(self._structures) >= MOST_STRUCTURES:
-                self._structures.clear()
-            self._structures[key] = self._structured(stands)
-        return self._structures[key]
-
-    def _structured(self, stands: np.ndarray) -> Structure:
-        interval, foot = np.nonzero(stands)
+    def _structured(self, stands: bytes) -> Structure:
+        """Return the structure of a schedule, the bytes of (K, 4) bool."""
+        interval, foot = np.nonzero(np.frombuffer(stands, dtype=bool).reshape(-1, 4))
         n, column_interval = len(interval), np.repeat(interval, 3)
         both = (column_interval[:, None], column_interval[None, :])
         A = np.zeros((n, 4, n, 3))
@@ -171,7 +158,7 @@ class ForcePlan:
     def solve(self, problem: Problem) -> np.ndarray | None:
         """Return the forces (K, 4, 3) on the feet, N, in the problem's frame; None if the solver found none."""
         H, g, A, upper, lower = self.programme(problem)
-        x, _, flag, _ = self._solve(H, g, A, upper, lower, self._structure(problem.stands).sense)
+        x, _, flag, _ = self._solve(H, g, A, upper, lower, self._structure(problem.stands.tobytes()).sense)
         if flag < 1:
             return None
         forces = np.zeros((*problem.stands.shape, 3))

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from go1exp import robot
-from go1exp.evaluate.controller.settings import SwingSettings
+from go1exp.evaluate.controller.types import Command
+
+DAMPING = 1e-3  # of the least squares of a swinging leg
 
 
 class Clock:
@@ -28,16 +30,6 @@ class Clock:
         """(4,) the legs' phases, 0 to 1."""
         return (self._phase + self._offsets) % 1.0
 
-    @property
-    def stance_time(self) -> float:
-        """Time that a foot stands in each cycle, s."""
-        return self.duty * self.period
-
-    @property
-    def swing_time(self) -> float:
-        """Time that a foot swings in each cycle, s."""
-        return (1.0 - self.duty) * self.period
-
     def stands(self) -> np.ndarray:
         """Return the scheduled stance (4,) bool."""
         return self.phases < self.duty
@@ -50,9 +42,6 @@ class Clock:
         """Return the scheduled stance (steps, 4) bool in the middle of each of the next intervals of ``dt`` s."""
         middles = (np.arange(steps) + 0.5)[:, None] * (dt / self.period)
         return (self._phase + middles + self._offsets) % 1.0 < self.duty
-
-
-LEGS = robot.NUM_LEGS
 
 
 class Feet:
@@ -70,10 +59,10 @@ class Feet:
 
     def restart(self) -> None:
         """Reset: the next call is the first one."""
-        self.down, self._planned = np.ones(LEGS, dtype=bool), np.ones(LEGS, dtype=bool)
-        self.lift, self.anchor = np.zeros((LEGS, 3)), np.zeros((LEGS, 3))
-        self.overdue = np.zeros(LEGS)
-        self._fresh = True
+        legs = robot.NUM_LEGS
+        self.down, self._planned = np.ones(legs, dtype=bool), np.ones(legs, dtype=bool)
+        self.lift, self.anchor = np.zeros((legs, 3)), np.zeros((legs, 3))
+        self.overdue, self._fresh = np.zeros(legs), True
 
     def update(self, clock: Clock, force: np.ndarray, places: np.ndarray) -> bool:
         """Update by forces (4,), N, and positions (4, 3), m, of the feet; return whether other feet stand."""
@@ -93,35 +82,24 @@ class Feet:
         return bool((self.down != before).any())
 
 
-SIDES = np.array([[1.0, -1.0], [1.0, 1.0], [-1.0, -1.0], [-1.0, 1.0]])
-"""(4, 2) signs of x and y of the legs."""
+SIDES = np.array([[1.0, -1.0], [1.0, 1.0], [-1.0, -1.0], [-1.0, 1.0]])  # (4, 2) signs of x and y of the legs
 
 HIPS = SIDES * [robot.HIP_OFFSET[0], robot.HIP_OFFSET[1] + robot.LINK_LENGTHS[0]]
 """(4, 2) points of the trunk above the nominal footholds: hip axes with abduction offset, trunk frame, m."""
 
-ACROSS = HIPS[:, ::-1] * [-1.0, 1.0]
-"""(4, 2) velocities of these points at a yaw rate of 1 rad/s, m/s."""
+ACROSS = HIPS[:, ::-1] * [-1.0, 1.0]  # (4, 2) velocities of these points at a yaw rate of 1 rad/s, m/s
 
 
-def footholds(
-    settings: SwingSettings,
-    velocity: np.ndarray,
-    command: tuple[float, float, float],
-    left: np.ndarray,
-    stance: float,
-    legs: np.ndarray,
-) -> np.ndarray:
+def footholds(gain: float, velocity: np.ndarray, command: Command, left: np.ndarray, legs: np.ndarray) -> np.ndarray:
     """Return footholds (n, 2) of ``legs`` (n,) from the trunk's origin, m; all in the axes of the robot's heading.
 
-    Below the position of the hip in mid-stance (Raibert 1986), plus ``velocity_gain`` times the error of the trunk's
-    ``velocity`` (3,), m/s. ``left`` (n,) is the time until each touch-down, ``stance`` the duration of the stance, s.
+    Below the position of the hip in mid-stance (Raibert 1986), plus ``gain``, s, times the error of the trunk's
+    ``velocity`` (3,), m/s. ``left`` (n,) is the time until the middle of each stance, s.
     """
     vx, vy, _ = velocity.tolist()
     x, y, yaw = command
-    hips = HIPS[legs]
     moving = yaw * ACROSS[legs] + [vx, vy]
-    too_fast = settings.velocity_gain * np.array([vx - x, vy - y])
-    return np.asarray(hips + moving * (left + 0.5 * stance)[:, None] + too_fast)
+    return np.asarray(HIPS[legs] + moving * left[:, None] + gain * np.array([vx - x, vy - y]))
 
 
 def way(
@@ -141,8 +119,8 @@ def way(
     return place, velocity
 
 
-def solved(jacobians: np.ndarray, vectors: np.ndarray, damping: float = 1e-3) -> np.ndarray:
+def solved(jacobians: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """Return joint changes (n, 3, k) that move feet by the columns of ``vectors`` (n, 3, k): damped least squares."""
     transposed = jacobians.transpose(0, 2, 1)
-    square = jacobians @ transposed + damping**2 * np.eye(3)
+    square = jacobians @ transposed + DAMPING**2 * np.eye(3)
     return np.asarray(transposed @ np.linalg.solve(square, vectors))

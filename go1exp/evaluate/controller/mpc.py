@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from go1exp import robot
-from go1exp.evaluate.controller.forces import Body, ForcePlan, Problem
+from go1exp.evaluate.controller.forces import ForcePlan, Problem
 from go1exp.evaluate.controller.gait import Clock, Feet, footholds, solved, way
 from go1exp.evaluate.controller.settings import MpcSettings
 from go1exp.evaluate.controller.state import Ground, Smoothed, frame, heading, matrix, roll_pitch_yaw, skew, wrapped
@@ -50,7 +50,7 @@ class Mpc:
         """Build the robot's model (``RobotConfig.inertia``) and the programme; raise SolverError without a solver."""
         self.settings, self.period = settings, settings.period
         self._kin = Kinematics(inertia)
-        self._plan = ForcePlan(settings.force, Body(self._kin.mass, self._kin.composite_inertia()))
+        self._plan = ForcePlan(settings.force, self._kin.mass, self._kin.composite_inertia())
         self._every = max(round(settings.force.every / settings.period), 1)
         gait, stance, smoothing = settings.gait, settings.stance, settings.smoothing
         self._clock = Clock(gait.offsets, gait.duty, gait.period)
@@ -92,8 +92,6 @@ class Mpc:
         self._since_plan += 1
         self._first = False
         return self._joint_commands(command)
-
-    # ------------------------------------------------------------------ state
 
     def _sense(self, sensed: Sensed) -> None:
         """Smooth the readings, update the kinematic model, and advance the clock."""
@@ -145,8 +143,6 @@ class Mpc:
         off = wrapped(self._heading + self.period * yaw - self._yaw)
         self._heading = self._yaw + max(-force.max_turn_lag, min(force.max_turn_lag, off))
 
-    # ------------------------------------------------------------------ feet on the ground
-
     def _push(self, command: Command) -> None:
         """Plan the forces of the feet, in axes of the heading whose origin is the ground below the trunk."""
         turn, force = self._turned.T, self.settings.force
@@ -192,8 +188,6 @@ class Mpc:
         wanted[:, 1, 2] = offset[2] + upright + wanted[:, 1, :2] @ slope
         return wanted
 
-    # ------------------------------------------------------------------ joint commands
-
     def _joint_commands(self, command: Command) -> LowCmd:
         """Return torques for the standing legs, and targets for the swinging ones."""
         kin, swing = self._kin, self.settings.swing
@@ -210,19 +204,21 @@ class Mpc:
             errors = np.empty((len(legs), 3, 2))
             errors[:, :, 0], errors[:, :, 1] = place - feet, velocity - moving
             change = solved(kin.jacobians[legs], errors)
-            target[legs] += _cut(change[:, :, 0], MOST_CHANGE)
-            torque[legs] += swing.kd * _cut(change[:, :, 1], MOST_SPEED)  # so that kd brakes differences only
+            target[legs] += np.clip(change[:, :, 0], -MOST_CHANGE, MOST_CHANGE)
+            # The joint velocity in the torque: kd brakes differences only.
+            torque[legs] += swing.kd * np.clip(change[:, :, 1], -MOST_SPEED, MOST_SPEED)
             kp[legs], kd[legs] = swing.kp, swing.kd
-        within = np.minimum(np.maximum(target.ravel(), LOW), HIGH)
-        return LowCmd(within, kp.ravel(), kd.ravel(), feedforward=_cut(torque.ravel(), LIMIT))
+        within, forward = np.clip(target.ravel(), LOW, HIGH), np.clip(torque.ravel(), -LIMIT, LIMIT)
+        return LowCmd(within, kp.ravel(), kd.ravel(), feedforward=forward)
 
     def _swing(self, command: Command, legs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return reference positions (n, 3), m, and velocities (n, 3), m/s, of the feet ``legs`` in the world."""
         swing, clock, overdue = self.settings.swing, self._clock, self._feet.overdue[legs]
-        duration = clock.swing_time
+        duration = (1.0 - clock.duty) * clock.period
         share = clock.swing_share()[legs]
         share[share < 0.0] = 1.0  # overdue: the swing has ended
-        below = footholds(swing, self._ahead, command, (1.0 - share) * duration, clock.stance_time, legs)
+        left = (1.0 - share) * duration + 0.5 * (clock.duty * clock.period)
+        below = footholds(swing.velocity_gain, self._ahead, command, left, legs)
         end = np.empty((len(legs), 3))
         end[:, :2] = below
         end[:, 2] = below @ self._slope() + (robot.FOOT_RADIUS - swing.depth - self._ground.height)
@@ -232,8 +228,3 @@ class Mpc:
             place[:, 2] -= np.minimum(further, swing.reach)
             velocity[:, 2] -= swing.reach_speed * ((overdue > 0.0) & (further < swing.reach))
         return place, velocity
-
-
-def _cut(values: np.ndarray, most: float | np.ndarray) -> np.ndarray:
-    """Return values within +- ``most``."""
-    return np.asarray(np.minimum(np.maximum(values, -most), most))

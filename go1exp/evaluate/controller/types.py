@@ -9,8 +9,7 @@ import numpy as np
 
 from go1exp.robot.messages import LowCmd, LowState
 
-Command = tuple[float, float, float]
-"""Commanded velocity of the trunk: x, y in m/s, yaw rate in rad/s, trunk frame."""
+Command = tuple[float, float, float]  # commanded velocity of the trunk: x, y in m/s, yaw rate in rad/s, trunk frame
 
 
 TrunkVelocity = Literal["exact", "estimated"]

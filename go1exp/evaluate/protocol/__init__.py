@@ -1,3 +1,1 @@
 """Protocols: commands, disturbances and ground over time, measures, and claims on figures (``conf/protocol``)."""
-
-from __future__ import annotations

@@ -12,25 +12,18 @@ from pydantic import Field
 
 from go1exp import robot
 from go1exp.base.report.plots import Drawing
-from go1exp.config.schema.registry import ConfigError, Term, bind_list, find, members, unknown_name, within
+from go1exp.config.schema.registry import ConfigError, Term, bind_list, find, members, unknown_name
 from go1exp.config.schema.settings import parse, settings
 from go1exp.evaluate.controller.types import TrunkVelocity
 from go1exp.evaluate.protocol.claims import Claim
 from go1exp.evaluate.protocol.plan import Motion
-from go1exp.evaluate.quantities import FINGERPRINT, LIFE, Column, Derived, Row, add_measures, columns_of
+from go1exp.evaluate.quantities import FINGERPRINT, LIFE, Column, Derived, Row, add_measures, columns_of, finite
 from go1exp.mdp.measures import measured
 
 if TYPE_CHECKING:
     from go1exp.evaluate.protocol.stage import Stage
 
 Count = Annotated[int, Field(ge=1)]
-
-Impulse = Annotated[float, Field(gt=0), within(0.0, 500.0, "N s")]
-"""Of a kick, N s: 500 N s give a Go1 39 m/s, and ten times as much ends the simulation."""
-
-Coordinate = Annotated[float, within(-0.5, 0.5, "m")]
-Point = tuple[Coordinate, Coordinate, Coordinate]
-"""Where a kick acts, from the trunk's origin in its frame, m: far off it would turn the trunk without limit."""
 
 
 @dataclass(frozen=True)
@@ -96,16 +89,11 @@ class Protocol:
     measures: tuple[Any, ...]
     claims: dict[str, Claim]
 
-    keys: ClassVar[tuple[str, ...]] = ()
-    """Columns that identify the condition of a row."""
-    robot_columns: ClassVar[tuple[Column, ...]] = ()
-    """Further figures of a robot."""
-    identical: ClassVar[bool] = True
-    """Whether the robots of a condition move identically where nothing is random."""
-    always: ClassVar[tuple[str, ...]] = ()
-    """Measures that are always computed."""
-    derived_names: ClassVar[tuple[str, ...]] = ()
-    """Names of the figures of all robots together."""
+    keys: ClassVar[tuple[str, ...]] = ()  # columns that identify the condition of a row
+    robot_columns: ClassVar[tuple[Column, ...]] = ()  # further figures of a robot
+    identical: ClassVar[bool] = True  # whether the robots of a condition move identically where nothing is random
+    always: ClassVar[tuple[str, ...]] = ()  # measures that are always computed
+    derived_names: ClassVar[tuple[str, ...]] = ()  # names of the figures of all robots together
 
     def terms(self) -> list[Term]:
         """Return the measures; raise ConfigError naming those that do not exist."""
@@ -160,12 +148,9 @@ def repeated(name: str, values: Sequence[Any]) -> list[str]:
     return [f"{name}: has {twice[0]} twice"] if twice else []
 
 
-def rounded(values: ArrayLike) -> list[Any]:
+def rounded(values: ArrayLike) -> Any:
     """Return values of any shape as plain data with four decimals; NaN as None."""
-    each = np.asarray(values, dtype=np.float64)
-    plain = each.round(4).astype(object)
-    plain[np.isnan(each)] = None
-    return list(plain.tolist())
+    return finite(np.asarray(values, dtype=np.float64).round(4).tolist())
 
 
 def bands(values: NDArray[np.float64], middle: Callable[..., Any]) -> NDArray[np.float64]:
@@ -186,8 +171,6 @@ def lives(motion: Motion) -> list[Row]:
         for fell, left, s, mark in lives_of_robots
     ]
 
-
-# ---------------------------------------------------------------------- from a configuration
 
 GRID = "grid"  # the protocol that is the grid of ``go1exp eval`` itself and has no keys here
 

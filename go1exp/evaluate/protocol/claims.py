@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from go1exp.config.schema.registry import NonNegative
@@ -58,21 +58,18 @@ def verdict(figure: Interval, claim: Claim) -> Word:
     the tolerance. inconclusive: the interval reaches from within the limits to beyond the tolerance (n is too small),
     or there is no interval. close: otherwise.
     """
-    beyond = _excess(figure.estimate, claim)
     if not all(map(math.isfinite, (figure.estimate, figure.low, figure.high))):
         return "inconclusive"
     low, high = sorted((_excess(figure.low, claim), _excess(figure.high, claim)))
-    if _both_sides(figure, claim):
-        low = min(low, 0.0)
     if high <= 0.0:
         return "met"
-    if low > 0.0:
-        return "close" if beyond <= claim.tolerance else "not met"
+    least, most = _bounds(claim)
+    if low > 0.0 and not (figure.low < least and figure.high > most):
+        return "close" if _excess(figure.estimate, claim) <= claim.tolerance else "not met"
     return "close" if high <= claim.tolerance else "inconclusive"
 
 
-ORDER: tuple[Word, ...] = ("not met", "inconclusive", "close", "met")
-"""From the worst to the best."""
+ORDER: tuple[Word, ...] = ("not met", "inconclusive", "close", "met")  # from the worst to the best
 
 
 def evaluated(claims: Mapping[str, Claim], summary: Sequence[Mapping[str, Any]]) -> list[Verdict]:
@@ -83,16 +80,19 @@ def evaluated(claims: Mapping[str, Claim], summary: Sequence[Mapping[str, Any]])
         for entry in summary:
             figure = entry["figures"].get(claim.quantity)
             if figure is not None and all(entry["condition"].get(k) == v for k, v in claim.where.items()):
-                estimate, low, high = (_number(figure[k]) for k in ("estimate", "low", "high"))
-                interval = Interval(estimate, low, high, figure["n"])
+                numbers = (math.nan if figure[k] is None else float(figure[k]) for k in ("estimate", "low", "high"))
+                interval = Interval(*numbers, figure["n"])
                 candidates.append(Verdict(name, verdict(interval, claim), claim, interval, entry["condition"], 0))
-        if not candidates:
-            nothing = Interval(math.nan, math.nan, math.nan, 0)
-            verdicts.append(Verdict(name, "inconclusive", claim, nothing, claim.where, 0))
-            continue
-        worst = min(candidates, key=lambda v: (ORDER.index(v.word), -_finite(_excess(v.figure.estimate, claim))))
-        verdicts.append(Verdict(name, worst.word, claim, worst.figure, worst.condition, len(candidates)))
+        nothing = Verdict(name, "inconclusive", claim, Interval(math.nan, math.nan, math.nan, 0), claim.where, 0)
+        worst = min(candidates, key=_rank, default=nothing)
+        verdicts.append(replace(worst, conditions=len(candidates)))
     return verdicts
+
+
+def _rank(verdict: Verdict) -> tuple[int, float]:
+    """Return the sort key of a verdict, the worst first."""
+    excess = _excess(verdict.figure.estimate, verdict.claim)
+    return ORDER.index(verdict.word), -excess if math.isfinite(excess) else -math.inf
 
 
 def limits(claim: Claim) -> str:
@@ -102,22 +102,13 @@ def limits(claim: Claim) -> str:
     return f"at least {claim.at_least:g}" if claim.at_least is not None else f"at most {claim.at_most:g}"
 
 
+def _bounds(claim: Claim) -> tuple[float, float]:
+    """Return the lower and upper limit of a claim, infinite where it has none."""
+    least = -math.inf if claim.at_least is None else claim.at_least
+    return least, math.inf if claim.at_most is None else claim.at_most
+
+
 def _excess(value: float, claim: Claim) -> float:
     """Return by how much a value is beyond the limits; negative within them."""
-    low = -math.inf if claim.at_least is None else claim.at_least - value
-    high = -math.inf if claim.at_most is None else value - claim.at_most
-    return max(low, high)
-
-
-def _both_sides(figure: Interval, claim: Claim) -> bool:
-    if claim.at_least is None or claim.at_most is None:
-        return False
-    return figure.low < claim.at_least and figure.high > claim.at_most
-
-
-def _number(value: Any) -> float:
-    return math.nan if value is None else float(value)
-
-
-def _finite(value: float) -> float:
-    return value if math.isfinite(value) else math.inf
+    least, most = _bounds(claim)
+    return max(least - value, value - most)

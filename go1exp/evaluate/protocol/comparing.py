@@ -12,13 +12,8 @@ from numpy.typing import NDArray
 
 from go1exp.evaluate.protocol.playing import Result
 from go1exp.evaluate.quantities import ROBOT, Column, Derived, Row, about, by_condition, plain, values
-from go1exp.evaluate.statistics.intervals import (
-    Interval,
-    bootstrap_interval,
-    paired_mean_interval,
-    paired_share_interval,
-    pairs_needed,
-)
+from go1exp.evaluate.statistics import intervals
+from go1exp.evaluate.statistics.intervals import Interval
 from go1exp.evaluate.statistics.runs import Word, verdict_by_interval
 
 DRAWS = 200  # bootstrap samples of the difference of a figure of all robots
@@ -29,16 +24,16 @@ class Difference:
     """Difference of one figure between a subject and the first one."""
 
     subject: str
-    quantity: str
+    figure: str  # its name
     unit: str
     condition: dict[str, Any]
     first: float  # figure of the first subject over the pairs
     other: float  # figure of the other subject
     difference: Interval  # other - first with its interval; n is the number of pairs
-    word: Word  # whether the other subject is better
+    verdict: Word  # whether the other subject is better
     # sample size for 80 % power at this difference, in pairs (robots, for a figure of all robots); None if it is
     # significant or zero
-    needed: int | None
+    pairs_needed: int | None
 
 
 def compared(first: Result, other: Result) -> list[Difference]:
@@ -72,10 +67,11 @@ def _difference(
     a, b = values(first, column.name), values(other, column.name)
     both = np.isfinite(a) & np.isfinite(b)
     a, b = a[both], b[both]
-    between = paired_share_interval(a, b) if column.how == "share" else paired_mean_interval(b - a)
+    shares = column.how == "share"
+    between = intervals.paired_share_interval(a, b) if shares else intervals.paired_mean_interval(b - a)
     assert column.better is not None
     verdict = verdict_by_interval(between, column.better)
-    needed = pairs_needed(b - a) if verdict == "no significant difference" else None
+    needed = intervals.pairs_needed(b - a) if verdict == "no significant difference" else None
     means = (float(a.mean()), float(b.mean())) if len(a) else (math.nan, math.nan)
     return Difference(subject, column.name, column.unit, condition, *means, between, verdict, needed)
 
@@ -89,9 +85,11 @@ def _of_all(subject: str, a: Derived, b: Derived, first: Sequence[Row], other: S
         return [row for k in sample for row in groups[which][robots[k]]]
 
     everyone = np.arange(len(robots))
-    between = bootstrap_interval(
-        lambda sample: b.function(drawn(1, sample)) - a.function(drawn(0, sample)), len(robots), DRAWS
-    )
+
+    def gain(sample: NDArray[np.intp]) -> float:
+        return b.function(drawn(1, sample)) - a.function(drawn(0, sample))
+
+    between = intervals.bootstrap_interval(gain, len(robots), DRAWS)
     assert a.better is not None
     verdict, needed = verdict_by_interval(between, a.better), None
     half = 0.5 * (between.high - between.low)
@@ -106,14 +104,5 @@ POWER = (1.96 + 0.842) / 1.96  # ratio of a difference to the half-width of its 
 
 def as_json(difference: Difference) -> dict[str, Any]:
     """Return a difference as plain data."""
-    d = difference
-    return {
-        "subject": d.subject,
-        "figure": d.quantity,
-        "condition": d.condition,
-        "first": d.first,
-        "other": d.other,
-        "difference": plain(d.difference, d.unit),
-        "verdict": d.word,
-        "pairs_needed": d.needed,
-    }
+    fields = {name: value for name, value in vars(difference).items() if name != "unit"}
+    return fields | {"difference": plain(difference.difference, difference.unit)}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -48,9 +49,6 @@ VERDICTS = (
 )
 
 
-# ---------------------------------------------------------------------- conditions
-
-
 def condition_text(condition: Mapping[str, Any]) -> str:
     """Return a condition as text; of a command, the axes that are not zero."""
     moving = any(condition.get(axis) for axis in COMMAND)
@@ -66,6 +64,11 @@ def _value(key: str, value: Any, condition: Mapping[str, Any]) -> str:
     return f"{word} {text} {unit}".rstrip() if key != "amplitude" else f"{word} {text}"
 
 
+def named(name: str, unit: str) -> str:
+    """Return a name with its unit, if it has one."""
+    return f"{name} ({unit})" if unit else name
+
+
 def falls(result: Result) -> str:
     """Return the number of falls in one line."""
     rows = result.played.rows
@@ -74,9 +77,6 @@ def falls(result: Result) -> str:
     text = f"{counted(count, 'fall')}, {left} left the map, in {minutes:.1f} moving robot-minutes ({len(rows)} rows)"
     down = len({row[ROBOT] for row in rows} - {row[ROBOT] for row in rows if row["fell"] is not None})
     return text + (f"; {counted(down, 'robot')} fell before anything counted." if down else ".")
-
-
-# ---------------------------------------------------------------------- tables
 
 
 def meanings(result: Result) -> dict[str, tuple[str, str]]:
@@ -118,23 +118,16 @@ def figure_tables(entries: Sequence[Entry], means: Meanings) -> list[Table]:
     for keys, those in groups.items():
         units = {name: _unit(name, those) for name in _names(those)}
         where = [condition_text(e["condition"]) for e in those] if keys else ["value [95 %] n"]
-        title = f"Results by {', '.join(map(_key_text, keys))}" if keys else "Results of all robots"
+        by = ", ".join(named(*KEYS.get(key, (key.replace("_", " "), ""))) for key in keys)
+        title = f"Results by {by}" if keys else "Results of all robots"
         cells = [[_cell(name, e["figures"].get(name), unit) for e in those] for name, unit in units.items()]
         if len(those) <= MANY:
             tables += _split(title, "quantity", _explained(units, means), where, cells)
         else:
             across: list[list[Any]] = [list(column) for column in zip(*cells, strict=True)]
             notes = [f"{name}: {means[name][1]}" if name in means else "" for name in units]
-            tables += _split(title, "condition", where, [_named(*head) for head in units.items()], across, notes)
+            tables += _split(title, "condition", where, [named(*head) for head in units.items()], across, notes)
     return tables
-
-
-def _key_text(key: str) -> str:
-    return _named(*KEYS.get(key, (key.replace("_", " "), "")))
-
-
-def _named(name: str, unit: str) -> str:
-    return f"{name} ({unit})" if unit else name
 
 
 def _unit(name: str, entries: Sequence[Entry]) -> str:
@@ -171,8 +164,8 @@ def _split(
         part = slice(start, start + wide)
         lines = [[row, *line[part]] for row, line in zip(rows, cells, strict=True) if any(line[part])]
         note = "; ".join(filter(None, notes[part]))
-        named = f"{title}, continued" if start else title
-        tables.append(Table(named, [corner, *columns[part]], lines, f"{note}." if note else ""))
+        whole = f"{title}, continued" if start else title
+        tables.append(Table(whole, [corner, *columns[part]], lines, f"{note}." if note else ""))
     return tables
 
 
@@ -181,7 +174,7 @@ def _explained(units: Mapping[str, str], means: Meanings) -> list[Cell]:
     heads, above = [], ""
     for name, unit in units.items():
         meaning = means.get(name, ("", ""))[1]
-        heads.append(Cell(_named(name, unit), "" if meaning == above else meaning, "name"))
+        heads.append(Cell(named(name, unit), "" if meaning == above else meaning, "name"))
         above = meaning
     return heads
 
@@ -221,7 +214,7 @@ def page(result: Result) -> str:
     protocol, means = result.chosen.protocol, meanings(result)
     repeats = f"; {result.repeats} bit-identical repeats excluded" if result.repeats else ""
     count = f"{len(result.played.rows)} rows, one per robot and condition{repeats}; {result.seconds:.0f} s."
-    by_word = {w: [v.name.replace("_", " ") for v in result.verdicts if v.word == w] for w in reversed(ORDER)}
+    of_words = {w: [v.name.replace("_", " ") for v in result.verdicts if v.word == w] for w in reversed(ORDER)}
     settings = {"settings": dataclasses.asdict(protocol), **result.about}
     tables = [claims_table(result, means), *figure_tables(result.summary, means)]
     content = sections(tables, protocol.drawings(result.played, result.summary))
@@ -231,7 +224,7 @@ def page(result: Result) -> str:
             kind=f"go1exp eval · protocol={result.chosen.key}",
             heading=result.label,
             lead=(type(protocol).__doc__ or "").strip().split("\n")[0],
-            verdicts=[(f"{word}: {len(names)}", ", ".join(names)) for word, names in by_word.items() if names],
+            verdicts=[(f"{word}: {len(names)}", ", ".join(names)) for word, names in of_words.items() if names],
             facts=[falls(result), *result.played.notes],
             sections=[*content, provenance([count, INTERVALS], settings)],
         )
@@ -248,9 +241,6 @@ def write(result: Result, folder: Path) -> list[Path]:
     return files
 
 
-# ---------------------------------------------------------------------- comparisons
-
-
 def comparison(
     plays: Mapping[str, Sequence[Result]], differences: Mapping[str, Sequence[Difference]], about: Mapping[str, Any]
 ) -> str:
@@ -264,28 +254,28 @@ def comparison(
             for d in results[0].chosen.protocol.compared(played, summaries)
         ]
     labels = [r.label for r in next(iter(plays.values()))]
+    words = [(d.verdict, f"{key}, {d.subject}: {d.figure}") for key, those in differences.items() for d in those]
     return render(
         Page(
             title=" vs. ".join(labels),
             kind="go1exp compare",
             heading=" · ".join(labels),
             lead=f"Comparison with {labels[0]}, paired by robot.",
-            verdicts=_verdicts(differences),
+            verdicts=by_word(words),
             facts=[f"{r.chosen.key}, {r.label}: {falls(r)}" for results in plays.values() for r in results],
             sections=[*sections(tables, drawings), provenance(PAIRING, about)],
         )
     )
 
 
-def _verdicts(differences: Mapping[str, Sequence[Difference]]) -> list[tuple[str, str]]:
-    """Return each word with the quantities that have it, for the page's head."""
+def by_word(named_verdicts: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Return each word of comparisons with the names that have it, for the page's head; of pairs (word, name)."""
     lines = []
     for word in COMPARED:
-        of_word = [f"{key}, {d.subject}: {d.quantity}" for key, ds in differences.items() for d in ds if d.word == word]
-        counts = {name: of_word.count(name) for name in of_word}
+        counts = Counter(name for of_name, name in named_verdicts if of_name == word)
         text = "; ".join(f"{name} (in {n} conditions)" if n > 1 else name for name, n in counts.items())
-        if of_word:
-            lines.append((f"{word}: {len(of_word)}", text if word != COMPARED[-1] else "listed below"))
+        if counts:
+            lines.append((f"{word}: {counts.total()}", text if word != COMPARED[-1] else "listed below"))
     return lines
 
 
@@ -293,28 +283,27 @@ def _counts(differences: Mapping[str, Sequence[Difference]]) -> Table:
     rows = []
     for key, those in differences.items():
         for subject in dict.fromkeys(d.subject for d in those):
-            words = [d.word for d in those if d.subject == subject]
+            words = [d.verdict for d in those if d.subject == subject]
             rows.append([key, subject, *(words.count(w) for w in COMPARED)])
     return Table("Verdicts", ["protocol", "subject", *COMPARED], rows, DIFFERENCES)
 
 
 def _differences(key: str, differences: Sequence[Difference], first: str, means: Meanings) -> Table:
     """Return the significant differences, then the others; quantities that are 0 for all subjects stand in the note."""
-    quantities = list(dict.fromkeys(d.quantity for d in differences))
-    not_zero = {d.quantity for d in differences if d.first != 0.0 or d.other != 0.0}
+    quantities = list(dict.fromkeys(d.figure for d in differences))
+    not_zero = {d.figure for d in differences if d.first != 0.0 or d.other != 0.0}
     zero = [name for name in quantities if name not in not_zero]
     subjects = list(dict.fromkeys(d.subject for d in differences))
     rows, above = [], ""
-    for d in sorted(differences, key=lambda d: (COMPARED.index(d.word), quantities.index(d.quantity))):
-        if d.quantity in zero:
+    for d in sorted(differences, key=lambda d: (COMPARED.index(d.verdict), quantities.index(d.figure))):
+        if d.figure in zero:
             continue
-        meaning = "" if d.quantity == above else means.get(d.quantity, ("", ""))[1]
-        head = Cell(f"{d.quantity} ({d.unit})" if d.unit else d.quantity, meaning, "name")
-        above = d.quantity
+        meaning = "" if d.figure == above else means.get(d.figure, ("", ""))[1]
+        head, above = Cell(named(d.figure, d.unit), meaning, "name"), d.figure
         between = spread(d.difference.estimate, d.difference.low, d.difference.high, f"n {d.difference.n}")
         who = [d.subject] if len(subjects) > 1 else []
-        where, needed = condition_text(d.condition), "" if d.needed is None else d.needed
-        rows.append([head, verdict(d.word), *who, where, number(d.first), number(d.other), between, needed])
+        where, needed = condition_text(d.condition), "" if d.pairs_needed is None else d.pairs_needed
+        rows.append([head, verdict(d.verdict), *who, where, number(d.first), number(d.other), between, needed])
     other = ["subject", "where", first, "subject's"] if len(subjects) > 1 else ["where", first, *subjects]
     header = ["quantity", "verdict", *other, "difference [95 %] n", "pairs needed"]
     return Table(key, header, rows, f"Omitted, 0 for all subjects: {', '.join(zero)}." if zero else "")

@@ -17,17 +17,7 @@ from go1exp.evaluate.agents import Agent, Progress
 from go1exp.evaluate.protocol.base import Chosen, Length, Played, Protocol
 from go1exp.evaluate.protocol.claims import Verdict, evaluated
 from go1exp.evaluate.protocol.stage import Rates, Setting, Stage
-from go1exp.evaluate.quantities import (
-    ROBOT,
-    Derived,
-    Row,
-    about,
-    by_condition,
-    coarse_note,
-    distinct,
-    plain,
-    summary,
-)
+from go1exp.evaluate.quantities import ROBOT, Derived, Row, about, by_condition, coarse_note, distinct, plain, summary
 from go1exp.evaluate.statistics.intervals import Interval, bootstrap_interval
 
 
@@ -113,19 +103,15 @@ def summarised(chosen: Chosen, rows: Sequence[Row]) -> list[dict[str, Any]]:
     protocol = chosen.protocol
     entries = summary(rows, protocol.keys, protocol.columns())
     for derived in protocol.derived(rows):
-        interval = thresholds(derived, rows)
+        interval = _threshold(derived, rows)
         figures = {derived.name: plain(interval, derived.unit)}
         entries.append({"condition": dict(derived.condition), "n": interval.n, "figures": figures})
     return entries
 
 
-def thresholds(derived: Derived, rows: Sequence[Row]) -> Interval:
-    """Return a figure of all robots together with its interval."""
+def _threshold(derived: Derived, rows: Sequence[Row]) -> Interval:
     of_robots = list(by_condition(about(rows, derived.condition), (ROBOT,)).values())
     return bootstrap_interval(lambda k: derived.function([r for n in k for r in of_robots[n]]), len(of_robots))
-
-
-# ---------------------------------------------------------------------- length
 
 
 def refuse(chosen: Chosen, stage: Stage) -> None:

@@ -16,8 +16,7 @@ Floats = NDArray[np.float64]
 
 RATE = "time/steps_per_s"
 STEPS, HOURS = "steps", "hours"
-AXES = {STEPS: "million environment steps", HOURS: "hours of training"}
-"""Column of the x axis -> its label."""
+AXES = {STEPS: "million environment steps", HOURS: "hours of training"}  # column of the x axis -> its label
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from go1exp import robot
 from go1exp.config.schema.registry import ConfigError, unknown_name
 from go1exp.evaluate.protocol.base import Chosen, Protocol, chosen
-from go1exp.evaluate.quantities import COLUMNS, DRAW, FELL, FILE, KEYS, MOVING, ROBOT, Column, columns_of, rows_file
+from go1exp.evaluate.quantities import AXES, COLUMNS, FELL, FILE, MOVING, ROBOT, Column, columns_of, rows_file
 from go1exp.evaluate.report.study import Run, Study
 from go1exp.mdp.measures import every_measure
 
@@ -117,8 +117,8 @@ def _evaluation(name: str, study: Study) -> Evaluation:
     first = next(iter(kept.values()))
     others = [run.label for run in study.runs if run.folder in entries and run.folder not in kept]
     if others:
-        other = next(e for e in entries.values() if e.sign != usual)
-        differ = _differing(first.settings, other.settings) or "columns of the rows"
+        one, other = first.settings, next(e.settings for e in entries.values() if e.sign != usual)
+        differ = ", ".join(k for k in {**one, **other} if one.get(k) != other.get(k)) or "columns of the rows"
         study.notes.append(f"{name}: {_listed(others)} excluded, evaluated with other settings ({differ}) than most")
     return _described(name, first, kept)
 
@@ -132,15 +132,11 @@ def _read(name: str, file: Path) -> RunRows:
     if name == GRID:
         if ROBOT not in table:
             raise ValueError(f"its rows have no column {ROBOT!r}")
-        return RunRows(table, settings, tuple(key for key in KEYS if key in table), None)
+        return RunRows(table, settings, tuple(key for key in AXES if key in table), None)
     if not isinstance(about.get("kind"), str) or not isinstance(about.get("settings"), dict):
         raise ConfigError(["it has no kind, or no settings, of a protocol"])
     protocol = chosen({name: {**about["settings"], "term": about["kind"]}})[0][0].protocol
     return RunRows(table, settings, tuple(key for key in (*protocol.keys, ROBOT) if key in table), protocol)
-
-
-def _differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
-    return ", ".join(k for k in {**one, **other} if one.get(k) != other.get(k))
 
 
 def _settings(name: str, about: Mapping[str, Any]) -> dict[str, Any]:
@@ -178,7 +174,7 @@ def _described(name: str, first: RunRows, runs: dict[Path, RunRows]) -> Evaluati
     if protocol is None:
         random = any(settings.get(key) for key in ("noise", "randomize", "push", "train_ground"))
         distinct = {f: e if random else _first_robots(e) for f, e in runs.items()}
-        return Evaluation(name, KEYS, _present(_grid_columns(), runs), MAIN, distinct, settings)
+        return Evaluation(name, AXES, _present(_grid_columns(), runs), MAIN, distinct, settings)
     columns = _present(protocol.columns(), runs)
     known = {c.name for c in columns if c.better}
     main = [c.quantity for c in protocol.claims.values() if c.quantity in known]
@@ -195,8 +191,3 @@ def _first_robots(evaluated: RunRows) -> RunRows:
     """Return one row of each command: without randomness all robots do the same."""
     first = evaluated.table[ROBOT] == 0.0
     return replace(evaluated, table={name: values[first] for name, values in evaluated.table.items()})
-
-
-def draws(evaluated: RunRows) -> dict[str, NDArray[np.float64]]:
-    """Return the randomised quantities of the robot of each row, (n,) by name."""
-    return {name.removeprefix(DRAW): v for name, v in evaluated.table.items() if name.startswith(DRAW)}

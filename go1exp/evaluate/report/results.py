@@ -11,33 +11,21 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from go1exp.evaluate.quantities import ROBOT, Column
+from go1exp.evaluate.quantities import DRAW, ROBOT, Column
 from go1exp.evaluate.report import curves as learning
 from go1exp.evaluate.report.curves import Curve
-from go1exp.evaluate.report.evaluations import Evaluation, RunRows, check_figures, draws, evaluations
+from go1exp.evaluate.report.evaluations import Evaluation, RunRows, check_figures, evaluations
 from go1exp.evaluate.report.settings import ReportSettings
 from go1exp.evaluate.report.study import Group, Study, baseline, groups
+from go1exp.evaluate.statistics import runs as over_runs
 from go1exp.evaluate.statistics.association import Association, associations
-from go1exp.evaluate.statistics.intervals import Interval, stratified_mean_interval
-from go1exp.evaluate.statistics.runs import (
-    ALPHA,
-    ORDER,
-    Difference,
-    Word,
-    clustered_share,
-    difference,
-    holm,
-    iqm_interval,
-    pooled_share,
-    runs_for_significance,
-    runs_needed,
-    share_bootstrap,
-    verdict_by_p,
-)
+from go1exp.evaluate.statistics.intervals import Interval, share_interval, stratified_mean_interval
+from go1exp.evaluate.statistics.runs import ALPHA, ORDER, Difference, Word, holm, iqm_interval
 
 Floats = NDArray[np.float64]
-Rows = Mapping[Path, NDArray[np.bool_]]
-"""Selected rows of each run."""
+Condition = tuple[tuple[str, Any], ...]  # its columns and their values; empty for all conditions together
+Source = Literal["setting", "drawn"]  # a swept setting (over runs), or a randomised quantity (over robots)
+Rows = Mapping[Path, NDArray[np.bool_]]  # selected rows of each run
 
 
 @dataclass(frozen=True)
@@ -50,7 +38,7 @@ class Figure:
     robots: Interval | None  # of a share, Wilson's interval over all robots of these runs; else None
     bootstrap: Interval | None  # of a share, the percentile interval over runs; else None
     values: Floats  # of each run, NaN where undefined
-    condition: tuple[tuple[str, Any], ...] = ()  # empty for all conditions together
+    condition: Condition = ()
 
 
 @dataclass(frozen=True)
@@ -74,13 +62,10 @@ class Verdict:
 class Sensitivity:
     """Correlation of one quantity with one result."""
 
-    source: Literal["setting", "drawn"]  # a swept setting (over runs), or a randomised quantity (over robots)
+    source: Source
     column: Column
     association: Association
     adjusted_p: float  # after Holm's correction over the quantities of the same source and result
-
-
-# ---------------------------------------------------------------------- quantities
 
 
 def figures(evaluation: Evaluation, made: Sequence[Group]) -> list[Figure]:
@@ -102,19 +87,15 @@ def by_condition(evaluation: Evaluation, made: Sequence[Group]) -> list[Figure]:
 
 
 def _figure(
-    evaluation: Evaluation,
-    group: Group,
-    column: Column,
-    rows: Rows | None = None,
-    condition: tuple[tuple[str, Any], ...] = (),
+    evaluation: Evaluation, group: Group, column: Column, rows: Rows | None = None, condition: Condition = ()
 ) -> Figure:
-    of_runs = _values(evaluation, group, column, rows)
-    means = _means(of_runs)
+    values = _values(evaluation, group, column, rows)
+    means = _means(values)
     if column.how != "share":
         return Figure(group.name, column, iqm_interval(means), None, None, means, condition)
-    counts, totals = [int(v.sum()) for v in of_runs], [len(v) for v in of_runs]
-    over_runs, robots = clustered_share(counts, totals), pooled_share(counts, totals)
-    return Figure(group.name, column, over_runs, robots, share_bootstrap(counts, totals), means, condition)
+    counts, totals = [int(v.sum()) for v in values], [len(v) for v in values]
+    of_runs, robots = over_runs.clustered_share(counts, totals), share_interval(sum(counts), sum(totals))
+    return Figure(group.name, column, of_runs, robots, over_runs.share_bootstrap(counts, totals), means, condition)
 
 
 def _values(evaluation: Evaluation, group: Group, column: Column, rows: Rows | None = None) -> list[Floats]:
@@ -131,40 +112,26 @@ def _means(values: Sequence[Floats]) -> Floats:
     return np.array([float(each.mean()) if len(each) else math.nan for each in values])
 
 
-# ---------------------------------------------------------------------- comparisons
-
-
-def compared(
-    evaluation: Evaluation,
-    made: Sequence[Group],
-    baseline: Group,
-    wanted: Sequence[str] | None,
-    correction: Literal["holm", "none"],
-    paired: bool,
-) -> list[Verdict]:
-    """Compare each evaluated group with the baseline, quantity by quantity.
-
-    ``wanted`` names quantities, as far as the evaluation has them; None takes its main ones. The correction is over all
-    quantities of all groups. ``paired`` pairs runs by their seed.
-    """
+def compared(evaluation: Evaluation, made: Sequence[Group], baseline: Group, settings: ReportSettings) -> list[Verdict]:
+    """Compare each evaluated group with the baseline; the correction is over all quantities of all groups."""
     known = {c.name: c for c in evaluation.columns if c.better}
-    columns = [known[name] for name in (wanted or evaluation.main) if name in known]
+    columns = [known[name] for name in (settings.figures or evaluation.main) if name in known]
+    corrected, paired = settings.correction == "holm", settings.paired
     evaluated = [g for g in made if any(run.folder in evaluation.runs for run in g.runs)]
     if baseline not in evaluated:
         return []
     subjects = [(g, c) for c in columns for g in evaluated if g is not baseline]
     samples = [_samples(evaluation, group, baseline, column, paired) for group, column in subjects]
-    differences = [difference(a, b, paired) for a, b in samples]
+    differences = [over_runs.difference(a, b, paired) for a, b in samples]
     p_values = [d.p for d in differences]
-    adjusted = holm(p_values) if correction == "holm" else p_values
-    family = sum(math.isfinite(p) for p in p_values) if correction == "holm" else 1
+    adjusted = holm(p_values) if corrected else p_values
+    family = sum(math.isfinite(p) for p in p_values) if corrected else 1
     entries = []
     for (group, column), (a, b), d, p in zip(subjects, samples, differences, adjusted, strict=True):
         assert column.better is not None
-        word, needed = verdict_by_p(d.estimate.estimate, p, column.better), None
+        word, needed = over_runs.verdict_by_p(d.estimate.estimate, p, column.better), None
         if word == ORDER[-1]:
-            level = ALPHA / max(family, 1)
-            needed = runs_needed(a[np.isfinite(a)], b[np.isfinite(b)], alpha=level)
+            needed = over_runs.runs_needed(a[np.isfinite(a)], b[np.isfinite(b)], alpha=ALPHA / max(family, 1))
         first, other = (float(iqm_interval(v).estimate) for v in (b, a))
         hopeless = not d.least_p * family <= ALPHA
         robots = _by_robot(evaluation, group, baseline, column)
@@ -217,21 +184,18 @@ def _mean(values: Floats) -> Floats:
     return np.asarray(np.where(known, values, 0.0).sum(axis=0) / np.where(count > 0, count, np.nan))
 
 
-# ---------------------------------------------------------------------- sensitivity
-
-
 def sensitivities(evaluation: Evaluation, made: Sequence[Group]) -> list[Sensitivity]:
     """Return the correlates of the main quantities of an evaluation."""
     entries: list[Sensitivity] = []
     for column in (c for c in evaluation.columns if c.name in evaluation.main):
-        entries += _corrected("setting", column, _of_settings(evaluation, made, column))
-        entries += _corrected("drawn", column, _of_draws(evaluation, column))
+        of_sources: dict[Source, list[Association]] = {
+            "setting": _of_settings(evaluation, made, column),
+            "drawn": _of_draws(evaluation, column),
+        }
+        for source, those in of_sources.items():
+            adjusted = holm([a.p for a in those])
+            entries += [Sensitivity(source, column, a, p) for a, p in zip(those, adjusted, strict=True)]
     return entries
-
-
-def _corrected(source: Literal["setting", "drawn"], column: Column, those: Sequence[Association]) -> list[Sensitivity]:
-    adjusted = holm([a.p for a in those])
-    return [Sensitivity(source, column, a, p) for a, p in zip(those, adjusted, strict=True)]
 
 
 def _of_settings(evaluation: Evaluation, made: Sequence[Group], column: Column) -> list[Association]:
@@ -256,7 +220,7 @@ def _of_draws(evaluation: Evaluation, column: Column) -> list[Association]:
     names: list[str] = []
     robots: dict[tuple[float, ...], list[float]] = {}
     for rows in evaluation.runs.values():
-        drawn = draws(rows)
+        drawn = {name.removeprefix(DRAW): v for name, v in rows.table.items() if name.startswith(DRAW)}
         names = names or (list(drawn) if column.name in rows.table else [])
         if column.name not in rows.table or not drawn or set(drawn) != set(names):
             continue  # trained, and therefore evaluated, with another randomisation
@@ -322,12 +286,11 @@ def report(study: Study, settings: ReportSettings, plain: dict[str, Any]) -> Rep
     evaluated = evaluations(study)
     check_figures(settings.figures or (), evaluated)
     for each in evaluated:
-        given = (settings.figures, settings.correction, settings.paired)
-        verdicts = compared(each, made, first, *given) if len(made) > 1 else []
+        verdicts = compared(each, made, first, settings) if len(made) > 1 else []
         if not any(run.folder in each.runs for run in first.runs):
             study.notes.append(f"{each.name}: the baseline has none, so that nothing is compared with it")
         together = max(len(verdicts), 1) if settings.correction == "holm" else 1
-        runs_required = runs_for_significance(settings.paired, together)
+        runs_required = over_runs.runs_for_significance(settings.paired, together)
         conditions, correlates = by_condition(each, made), sensitivities(each, made)
         outcomes.append(Outcome(each, figures(each, made), conditions, verdicts, runs_required, correlates))
     return Report(study, made, first, drawn, outcomes, plain)

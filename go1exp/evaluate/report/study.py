@@ -74,9 +74,6 @@ class Group:
     runs: list[Run]
 
 
-# ---------------------------------------------------------------------- runs
-
-
 @dataclass(frozen=True)
 class _Job:
     name: str
@@ -181,9 +178,6 @@ def _included(runs: Sequence[Run], absent: list[Absent], notes: list[str], unfin
         listed = "; ".join(f"{a.label}: {a.state} ({a.cause})" for a in absent[:5])
         raise ConfigError([f"folders: none of the {len(absent)} runs in them counts: {listed}"])
     return Study(kept, absent, notes)
-
-
-# ---------------------------------------------------------------------- groups
 
 
 def groups(study: Study) -> list[Group]:

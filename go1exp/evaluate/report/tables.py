@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from go1exp.base.report.table import NOTHING, Cell, Table, interval_text, number, spread, verdict
-from go1exp.evaluate.protocol.pages import condition_text
+from go1exp.evaluate.protocol.pages import condition_text, named
 from go1exp.evaluate.quantities import Column
 from go1exp.evaluate.report.results import Figure, Outcome, Report, Verdict
 from go1exp.evaluate.statistics.intervals import Interval
@@ -36,13 +36,12 @@ COMPARED = (
 MOST_KEYS = 5  # settings of groups that have columns of their own; more are in the CSV file
 MOST_COLUMNS = 6  # columns of the table of quantities
 
-SOURCES = {"setting": "swept", "drawn": "randomised"}
-"""Source of a sensitivity -> its word."""
+SOURCES = {"setting": "swept", "drawn": "randomised"}  # source of a sensitivity -> its word
 
 
 def label(column: Column) -> str:
     """Return a quantity with its unit."""
-    return f"{column.name} ({column.unit})" if column.unit else column.name
+    return named(column.name, column.unit)
 
 
 def tables(made: Report) -> list[Table]:
@@ -153,9 +152,6 @@ def _groups(made: Report) -> Table:
     return Table("Groups", ["group", *shown, "runs", "seeds", "folders"], rows, note)
 
 
-# ---------------------------------------------------------------------- plain rows
-
-
 def plain_rows(made: Report) -> dict[str, list[PlainRow]]:
     """Return every table of the report as rows of plain data, by the name of its CSV file."""
     files: dict[str, list[PlainRow]] = {"runs": _run_rows(made), "curves": _curve_rows(made)}
@@ -193,8 +189,7 @@ def _figure_row(f: Figure) -> PlainRow:
     row |= {"unit": f.column.unit, "estimate": f.runs.estimate}
     row |= {"low": f.runs.low, "high": f.runs.high, "runs": f.runs.n}
     for name, interval in (("wilson", f.robots), ("bootstrap", f.bootstrap)):
-        row[f"{name}_low"] = "" if interval is None else interval.low
-        row[f"{name}_high"] = "" if interval is None else interval.high
+        row |= {f"{name}_{bound}": getattr(interval, bound, "") for bound in ("low", "high")}
     return row
 
 
@@ -209,28 +204,14 @@ def _value_rows(outcome: Outcome, made: Report) -> list[PlainRow]:
 
 
 def _verdict_row(v: Verdict, baseline: str) -> PlainRow:
-    d, robots = v.difference, v.robots
-    return {
-        "group": v.group,
-        "baseline": baseline,
-        "figure": v.column.name,
-        "unit": v.column.unit,
-        "verdict": v.word,
-        "of_baseline": v.first,
-        "of_group": v.other,
-        "difference": d.estimate.estimate,
-        "low": d.estimate.low,
-        "high": d.estimate.high,
-        "runs": d.estimate.n,
-        "p": d.p,
-        "p_adjusted": v.adjusted_p,
-        "hedges_g": d.effect,
-        "probability_of_more": d.improvement,
-        "same_robots": "" if robots is None else robots.estimate,
-        "same_robots_low": "" if robots is None else robots.low,
-        "same_robots_high": "" if robots is None else robots.high,
-        "runs_needed": "" if v.needed is None else v.needed,
-    }
+    d, over_runs, of_robots = v.difference, v.difference.estimate, v.robots
+    row: PlainRow = {"group": v.group, "baseline": baseline, "figure": v.column.name, "unit": v.column.unit}
+    row |= {"verdict": v.word, "of_baseline": v.first, "of_group": v.other}
+    row |= {"difference": over_runs.estimate, "low": over_runs.low, "high": over_runs.high, "runs": over_runs.n}
+    row |= {"p": d.p, "p_adjusted": v.adjusted_p, "hedges_g": d.effect, "probability_of_more": d.improvement}
+    for name, bound in (("same_robots", "estimate"), ("same_robots_low", "low"), ("same_robots_high", "high")):
+        row[name] = getattr(of_robots, bound, "")
+    return row | {"runs_needed": "" if v.needed is None else v.needed}
 
 
 def _sensitivity_rows(outcome: Outcome) -> list[PlainRow]:

@@ -17,11 +17,11 @@ from go1exp.base.files import write_json, write_text
 from go1exp.base.report.page import Page, provenance, render, sections
 from go1exp.base.report.plots import COLOURS, WIDE, Drawing, band, legend, listing, panels
 from go1exp.base.wording import counted
+from go1exp.evaluate.protocol.pages import by_word
 from go1exp.evaluate.quantities import finite
 from go1exp.evaluate.report.curves import AXES, Curve
 from go1exp.evaluate.report.results import Figure, Report, Sensitivity
 from go1exp.evaluate.report.tables import SOURCES, PlainRow, about_baseline, label, plain_rows, tables
-from go1exp.evaluate.statistics.runs import ORDER
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Painting
@@ -53,7 +53,7 @@ def page(made: Report) -> str:
             kind="go1exp report",
             heading=names,
             lead=f"{counted(count, 'run')} in {counted(len(made.groups), 'group')}; {about_baseline(made)}.",
-            verdicts=_head(made),
+            verdicts=by_word([(v.word, f"{v.group}: {v.column.name}") for o in made.outcomes for v in o.verdicts]),
             facts=[*([f"{counted(excluded, 'run')} excluded, listed below."] * bool(excluded)), *made.study.notes],
             sections=[
                 *sections(tables(made), drawings),
@@ -61,16 +61,6 @@ def page(made: Report) -> str:
             ],
         )
     )
-
-
-def _head(made: Report) -> list[tuple[str, str]]:
-    """Return each word with the groups and quantities that have it, for the page's head."""
-    lines = []
-    for word in ORDER:
-        those = [f"{v.group}: {v.column.name}" for o in made.outcomes for v in o.verdicts if v.word == word]
-        if those:
-            lines.append((f"{word}: {len(those)}", "; ".join(those) if word != ORDER[-1] else "listed below"))
-    return lines
 
 
 def csv_text(rows: Sequence[PlainRow]) -> str:
@@ -120,8 +110,7 @@ def short(name: str, letters: int) -> str:
     return name if len(name) <= letters else f"{name[: letters - 1]}…"
 
 
-Looks = Mapping[str, tuple[str, str]]
-"""Group -> colour and line style, the same in all figures of a report."""
+Looks = Mapping[str, tuple[str, str]]  # group -> colour and line style, the same in all figures of a report
 
 
 def looks(groups: Sequence[str]) -> Looks:

@@ -63,9 +63,6 @@ def share_interval(count: int, n: int) -> Interval:
     return Interval(count / n, float(bounds.low), float(bounds.high), n)
 
 
-# ---------------------------------------------------------------------- counts, medians, curves
-
-
 def rate_interval(count: int, exposure: float) -> Interval:
     """Return ``count`` / ``exposure`` with the exact Poisson interval (Garwood 1936); n is the count."""
     if not exposure > 0:
@@ -132,9 +129,6 @@ def logistic_fit(x: ArrayLike, success: ArrayLike) -> Logistic | None:
     start = np.array([float(won.mean()), np.log(8.0)])
     solution = scipy.optimize.minimize(loss, start, method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-6})
     return Logistic(float(at.min() + span * solution.x[0]), float(np.exp(solution.x[1]) / span))
-
-
-# ---------------------------------------------------------------------- pairs
 
 
 def paired_mean_interval(difference: ArrayLike) -> Interval:

@@ -18,7 +18,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from go1exp.evaluate.statistics.intervals import LEVEL, POWER, Interval, constant, share_interval
+from go1exp.evaluate.statistics.intervals import LEVEL, POWER, Interval, constant
 
 TRIM = 0.25  # share of the values that the interquartile mean omits at each end
 WINSORISED_FROM = 6  # least number of runs with a winsorised standard error
@@ -77,9 +77,6 @@ def _critical(n: int) -> float:
     return float(np.quantile(np.abs(iqm(sample)) / _standard_error(sample), LEVEL))
 
 
-# ---------------------------------------------------------------------- falls
-
-
 def clustered_share(counts: ArrayLike, totals: ArrayLike) -> Interval:
     """Return the share of falls with its interval over runs, within which falls are correlated.
 
@@ -119,11 +116,6 @@ def share_bootstrap(counts: ArrayLike, totals: ArrayLike) -> Interval:
     return Interval(float(fell.sum() / robots.sum()), float(low), float(high), n)
 
 
-def pooled_share(counts: ArrayLike, totals: ArrayLike) -> Interval:
-    """Return the share of falls with Wilson's interval over all robots: of these policies alone."""
-    return share_interval(int(np.sum(counts)), int(np.sum(totals)))
-
-
 Word = Literal["better", "worse", "no significant difference"]
 Direction = Literal["lower", "higher"]
 
@@ -131,9 +123,7 @@ ORDER: tuple[Word, ...] = ("better", "worse", "no significant difference")
 
 RESAMPLES = 20_000  # permutations of a test; where there are fewer, all of them
 
-LEAST_RANDOM_P = 2.0 / (RESAMPLES + 1)
-"""Smallest two-sided p of random permutations, which include the observed one."""
-
+LEAST_RANDOM_P = 2.0 / (RESAMPLES + 1)  # smallest two-sided p of random permutations, which include the observed one
 ALPHA = 1.0 - LEVEL
 
 
@@ -229,11 +219,8 @@ def holm(p_values: Sequence[float]) -> list[float]:
     """Return p-values adjusted for their number (Holm 1979), in the same order; NaNs stay and are not counted."""
     p = np.asarray(p_values, dtype=np.float64)
     adjusted = np.full_like(p, np.nan)
-    order = [int(k) for k in np.argsort(p) if np.isfinite(p[k])]
-    largest = 0.0
-    for place, k in enumerate(order):
-        largest = max(largest, min(1.0, float(p[k]) * (len(order) - place)))
-        adjusted[k] = largest
+    order = np.argsort(p)[: np.isfinite(p).sum()]  # NaNs come last
+    adjusted[order] = np.maximum.accumulate(np.minimum(p[order] * np.arange(len(order), 0, -1), 1.0))
     return [float(value) for value in adjusted]
 
 

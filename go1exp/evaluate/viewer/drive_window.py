@@ -2,29 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Any
 
 from mujoco.studio.dear_imgui import dear_imgui as imgui
+from mujoco.studio.implot import implot
 
 from go1exp.evaluate.video import steer
 from go1exp.evaluate.viewer import requests as ask
 from go1exp.evaluate.viewer.page_server import PUSH, STAND, Gamepad, steered
-from go1exp.evaluate.viewer.walk import WalkView
-from go1exp.evaluate.viewer.window import (
-    MESSAGE_LINES,
-    Curves,
-    EffectsPanel,
-    PushPanel,
-    ReleasedSlider,
-    Vec2,
-    Window,
-    arrow_shape,
-    paragraph,
-    section,
-)
-
-SLOW = imgui.Vec4(1.0, 0.7, 0.3, 1.0)
+from go1exp.evaluate.viewer.session import SPAN
+from go1exp.evaluate.viewer.walk import Reward, WalkView
+from go1exp.evaluate.viewer.window import MESSAGE_LINES, SLOW, Line, LiveWindow, Vec2, paragraph, section
 
 TOO_SLOW = "cannot keep real time"
 
@@ -39,29 +28,24 @@ KEYS = {
 }
 """Key -> its code in ``evaluate.video.STEERING``; 0 commands zero, as the space bar in the live window."""
 
-PUSH_KEY = imgui.Key.P
-
 AXES = ("forward m/s", "left m/s", "yaw rad/s")
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0)
 RATES = (None, 0.001, 0.002, 0.004, 0.005)  # physics steps to choose from, s; None is that of training
 MOST_BUTTONS = 6  # number of policies up to which each has a button; more are a list
 VELOCITIES = ("exact", "estimated")
+VELOCITY_AXES = (("x", "m/s"), ("y", "m/s"), ("yaw", "rad/s"))
+SPARK = 22.0  # height of a reward's curve, pixels
+GOOD, BAD = imgui.Vec4(0.35, 0.75, 0.4, 0.9), imgui.Vec4(0.9, 0.4, 0.3, 0.9)
 
 HELP = ("arrows: forward, back, yaw", "comma, full stop: left, right", "0 zero, P push, space pause")
 
 
-class DriveWindow(Window):
-    """Panels of a simulation; ``places`` of controls on the page are left, top, right, bottom, pixels."""
+class DriveWindow(LiveWindow):
+    """Panels of a simulation."""
 
     def __init__(self, pad: Gamepad) -> None:
-        super().__init__("Robot", "Curves")
+        super().__init__()
         self._command, self._pad, self._sticks = [0.0, 0.0, 0.0], pad, False
-        self._push = PushPanel(self.ask)
-        self._plots = Curves()
-        self._effects, self._slider = EffectsPanel(self.ask), ReleasedSlider()
-        self.places = self._push.places
-
-    # ------------------------------------------------------------------ keys and gamepad
 
     def keys(self) -> None:
         """Answer keys."""
@@ -75,10 +59,7 @@ class DriveWindow(Window):
             self._steer()
         if imgui.IsKeyPressed(imgui.Key.Space, False):
             self.ask(ask.Pace(not view.pace.paused, view.pace.speed))
-        if imgui.IsKeyPressed(PUSH_KEY, False):
-            self._push.push()
-        if imgui.IsKeyPressed(imgui.Key.Backspace, False):
-            self.ask(ask.Reset())
+        super().keys()
 
     def gamepad(self) -> None:
         """Apply the gamepad: sticks scale to the sliders' ranges; released sticks command zero."""
@@ -92,7 +73,7 @@ class DriveWindow(Window):
         if self._command != before:
             self._steer()
         for _ in range(presses.count(PUSH)):
-            self._push.push()
+            self.push()
 
     def _bounded(self, view: WalkView) -> None:
         self._command = [min(max(v, a), b) for v, (a, b) in zip(self._command, view.limits, strict=True)]
@@ -100,8 +81,6 @@ class DriveWindow(Window):
     def _steer(self) -> None:
         x, y, yaw = self._command
         self.ask(ask.Command((x, y, yaw)))
-
-    # ------------------------------------------------------------------ panels
 
     def left(self) -> None:
         """Draw the panels."""
@@ -111,7 +90,7 @@ class DriveWindow(Window):
         if section("Command"):
             self._command_panel(view)
         if section("Push"):
-            self._push.draw()
+            self.push_panel()
         if section("Policy"):
             self._drivers_panel(view)
         if section("Ground"):
@@ -119,19 +98,16 @@ class DriveWindow(Window):
         if section("Sensors, delay, physics"):
             self._conditions_panel(view)
         if section("Effects", is_open=False):
-            self._effects.draw(view.setup.sizes, view.effects)
+            self.effects_panel(view.setup.sizes, view.effects)
 
     def right(self) -> None:
         """Draw the curves."""
-        self._plots.draw(self.view)
-
-    def scene(self) -> Iterable[Any]:
-        """Return the arrows."""
-        return [arrow_shape(arrow) for arrow in self.view.arrows]
-
-    def _note(self, name: str) -> None:
-        low, high = imgui.GetItemRectMin(), imgui.GetItemRectMax()
-        self.places[name] = (low.x, low.y, high.x, high.y)
+        view: WalkView = self.view
+        if section("Velocity: commanded, true, estimated"):
+            self._velocity(view)
+        self.body_curves()
+        if section(f"Rewards: {len(view.rewards)} terms, {view.total:+.2f} per s"):
+            self._rewards(view.rewards)
 
     def _time(self, view: WalkView) -> None:
         pace = view.pace
@@ -163,7 +139,7 @@ class DriveWindow(Window):
         for axis, (name, (low, high)) in enumerate(zip(AXES, view.limits, strict=True)):
             imgui.SetNextItemWidth(-85.0)
             changed, value = imgui.SliderFloat(name, self._command[axis], low, high, "%.2f")
-            self._note(name)
+            self.note(name)
             if changed:
                 self._command[axis] = value
                 self._steer()
@@ -201,7 +177,7 @@ class DriveWindow(Window):
                 self.ask(ask.SelectGround(setup.ground, setup.level, ground.tiles[index]))
         if ground.hardest:
             shown = "%.0f" if ground.tiles else "%.2f"
-            level = self._slider.draw(f"level {ground.unit}", setup.level, ground.hardest, shown)
+            level = self.released_slider(f"level {ground.unit}", setup.level, ground.hardest, shown)
             if level is not None:
                 self.ask(ask.SelectGround(setup.ground, level, setup.tile))
 
@@ -211,7 +187,7 @@ class DriveWindow(Window):
         changed, noise = imgui.Checkbox("sensor noise", now.noise)
         if changed:
             wanted["noise"] = noise
-        delay = self._slider.draw("delay ms", 1e3 * now.delay, 60.0, "%.0f")
+        delay = self.released_slider("delay ms", 1e3 * now.delay, 60.0, "%.0f")
         if delay is not None:
             wanted["delay"] = 1e-3 * delay
         imgui.SetNextItemWidth(-85.0)
@@ -228,6 +204,49 @@ class DriveWindow(Window):
             wanted["trunk_velocity"] = VELOCITIES[index]
         if wanted:
             self.ask(ask.Conditions(**{**now.__dict__, **wanted}))
+
+    def _velocity(self, view: WalkView) -> None:
+        for axis, (name, unit) in enumerate(VELOCITY_AXES):
+            lines: list[Line] = [("estimated", view.estimated[axis])] if view.estimated else []
+            lines += [("commanded", view.command_curves[axis]), ("true", view.true[axis])]  # the last one lies on top
+            self.plot(f"##{name}", f"{name}  {unit}", lines, view.limits[axis])
+
+    def _rewards(self, rewards: Sequence[Reward]) -> None:
+        """Draw a row for each term: its name, its mean of the last second, a bar, and its curve."""
+        largest = max((abs(r.mean) for r in rewards), default=0.0) or 1.0
+        if not imgui.BeginTable("rewards", 4, int(imgui.TableFlags.SizingFixedFit)):
+            return
+        stretch = int(imgui.TableColumnFlags.WidthStretch)
+        for name, flags in (("term", 0), ("per s", 0), ("mean of 1 s", stretch), (f"last {SPAN:g} s", stretch)):
+            imgui.TableSetupColumn(name, flags)
+        imgui.TableHeadersRow()
+        for reward in rewards:
+            self._reward(reward, largest)
+        imgui.EndTable()
+
+    def _reward(self, reward: Reward, largest: float) -> None:
+        imgui.TableNextRow()
+        imgui.TableNextColumn()
+        imgui.TextUnformatted(reward.name)
+        imgui.TableNextColumn()
+        imgui.TextUnformatted(f"{reward.mean:+7.3f}")
+        imgui.TableNextColumn()
+        corner, width = imgui.GetCursorScreenPos(), imgui.GetContentRegionAvail().x
+        middle = corner.x + 0.5 * width
+        end = middle + 0.5 * width * reward.mean / largest
+        colour = imgui.GetColorU32(GOOD if reward.mean >= 0.0 else BAD)
+        box = Vec2(min(middle, end), corner.y + 4.0), Vec2(max(middle, end, middle + 1.0), corner.y + SPARK - 4.0)
+        imgui.GetWindowDrawList().AddRectFilled(*box, colour)
+        imgui.Dummy(Vec2(width, SPARK))
+        imgui.TableNextColumn()
+        flags = int(implot.Flags.CanvasOnly) | int(implot.Flags.NoInputs) | int(implot.Flags.NoFrame)
+        implot.PushStyleVar(int(implot.StyleVar.PlotPadding), Vec2(0.0, 1.0))  # or nothing is left of so small a plot
+        if reward.curve and implot.BeginPlot(f"##{reward.name}", Vec2(-1.0, SPARK), flags):
+            axis = int(implot.AxisFlags.NoDecorations) | int(implot.AxisFlags.AutoFit)
+            implot.SetupAxes("", "", axis, axis)
+            implot.PlotLine("value", list(range(len(reward.curve))), reward.curve)
+            implot.EndPlot()
+        implot.PopStyleVar()
 
 
 def _nearest(values: tuple[float, ...], value: float) -> int:

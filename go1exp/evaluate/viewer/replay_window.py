@@ -10,19 +10,8 @@ import numpy as np
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.implot import implot
 
-from go1exp.evaluate.viewer.replay import (
-    MODELS,
-    MOST,
-    UNITS,
-    Choose,
-    Ghost,
-    Magnify,
-    Piece,
-    Play,
-    ReplayView,
-    Seek,
-    Story,
-)
+from go1exp.evaluate.viewer import replay as ask
+from go1exp.evaluate.viewer.replay import MODELS, MOST, UNITS, Ghost, Piece, ReplayView, Story
 from go1exp.evaluate.viewer.window import Vec2, Window, paragraph, section
 
 COLOURS: dict[str, tuple[float, float, float, float]] = {
@@ -53,8 +42,6 @@ class ReplayWindow(Window):
         self._model: mujoco.MjModel | None = None
         self._key: Any = None
         self._lines: dict[str, Any] = {}
-
-    # ------------------------------------------------------------------ the scene
 
     def sight(self) -> tuple[Any, float]:
         """Return a place between the robots, from far enough to see all."""
@@ -90,20 +77,18 @@ class ReplayWindow(Window):
             geom.category = int(mujoco.mjtCatBit.mjCAT_DECOR)
         return shapes
 
-    # ------------------------------------------------------------------ panels
-
     def keys(self) -> None:
         """Answer keys."""
         view: ReplayView = self.view
         if imgui.IsKeyPressed(imgui.Key.Space, False):
-            self.ask(Play(not view.running, view.speed))
+            self.ask(ask.Play(not view.running, view.speed))
         step = 0.01 * self._story.pieces[view.number].duration
         for key, sign in ((imgui.Key.LeftArrow, -1.0), (imgui.Key.RightArrow, 1.0)):
             if imgui.IsKeyPressed(key):
-                self.ask(Seek(view.time + sign * step))
+                self.ask(ask.Seek(view.time + sign * step))
         for key, sign in ((imgui.Key.UpArrow, -1), (imgui.Key.DownArrow, 1)):
             if imgui.IsKeyPressed(key):
-                self.ask(Choose(view.number + sign))
+                self.ask(ask.Choose(view.number + sign))
 
     def left(self) -> None:
         """Draw time line, pieces and joints."""
@@ -117,26 +102,26 @@ class ReplayWindow(Window):
         if len(self._story.pieces) > 1 and section("Held-out windows"):
             for k, other in enumerate(self._story.pieces):
                 if imgui.RadioButton(f"{other.title}##{k}", k == view.number):
-                    self.ask(Choose(k))
+                    self.ask(ask.Choose(k))
         if section("Joint: error of the angle, mrad"):
             self._joints(piece)
 
     def _time(self, view: ReplayView, piece: Piece) -> None:
         if imgui.Button("Pause" if view.running else "Play"):
-            self.ask(Play(not view.running, view.speed))
+            self.ask(ask.Play(not view.running, view.speed))
         imgui.SameLine()
         imgui.SetNextItemWidth(80.0)
         near = min(range(len(SPEEDS)), key=lambda k: abs(SPEEDS[k] - view.speed))
         changed, index = imgui.Combo("speed", near, [f"{v:g}x" for v in SPEEDS])
         if changed:
-            self.ask(Play(view.running, SPEEDS[index]))
+            self.ask(ask.Play(view.running, SPEEDS[index]))
         if self._story.kind == "log":  # the camera cannot follow two robots
             imgui.SameLine()
             _, self.follow = imgui.Checkbox("follow", self.follow)
         imgui.SetNextItemWidth(-40.0)
         changed, time = imgui.SliderFloat("s", view.time, 0.0, piece.duration, "%.3f")
         if changed:
-            self.ask(Seek(time))
+            self.ask(ask.Seek(time))
         imgui.TextDisabled("space: play, pause")
         imgui.TextDisabled("arrows: time, window")
 
@@ -144,7 +129,7 @@ class ReplayWindow(Window):
         imgui.SetNextItemWidth(-110.0)
         changed, times = imgui.SliderFloat("magnified", view.magnify, 1.0, MOST, "%.0f times")
         if changed:
-            self.ask(Magnify(times))
+            self.ask(ask.Magnify(times))
         paragraph("errors in the scene only; curves and numbers are not magnified")
         _, self._ghosts_shown = imgui.Checkbox("measured, and after", self._ghosts_shown)
         paragraph("Left: before, the nominal model. Right, green: after, with the identified effects. Blue: measured.")
@@ -166,8 +151,6 @@ class ReplayWindow(Window):
                 imgui.TableNextColumn()
                 imgui.TextUnformatted(f"{1e3 * errors[joint][name]:.2f}")
         imgui.EndTable()
-
-    # ------------------------------------------------------------------ curves
 
     def right(self) -> None:
         """Draw the curves of the chosen joint."""

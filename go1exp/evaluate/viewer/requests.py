@@ -21,8 +21,7 @@ from go1exp.sim.effects.tolerances import Tolerances
 from go1exp.sim.task import TaskConfig, parse_parts
 from go1exp.sim.terrain import TerrainConfig, build_terrain
 
-Velocity = tuple[float, float, float]
-"""x and y, m/s, and yaw rate, rad/s, in the trunk's frame."""
+Velocity = tuple[float, float, float]  # x and y, m/s, and yaw rate, rad/s, in the trunk's frame
 
 
 @dataclass(frozen=True)

@@ -120,8 +120,6 @@ class Session:
         self._build(label, setup)
         self._begin()
 
-    # ------------------------------------------------------------------ building
-
     def _agent(self, label: str) -> Agent:
         if label not in self.robots.agents:
             raise ConfigError([f"policy {label!r}: known are {', '.join(self.robots.agents)}"])
@@ -197,8 +195,6 @@ class Session:
         if self._estimate is not None:
             self._estimate.restart(0)
 
-    # ------------------------------------------------------------------ requests
-
     def ask(self, request: requests.Request) -> None:
         """Apply a request, or give the reason of its rejection in ``message``."""
         try:
@@ -241,8 +237,6 @@ class Session:
         self._kicker.use(one_push(self._kicker.time, impulse, direction))
         angle = float(heading(self.core.backend.qpos[:, 3:7])[0]) + direction
         self.push = PushMade(self.time, impulse, angle)
-
-    # ------------------------------------------------------------------ time
 
     @property
     def history(self) -> History:
@@ -292,8 +286,6 @@ class Session:
             gyro = core.plant.sense(s).base_ang_vel_b if core.plant.effects.senses else s.base_ang_vel_b
             row["estimated"] = np.array([*self._estimate.velocities()[0, :2], float(gyro[0, 2])])
         self.history.add(row)
-
-    # ------------------------------------------------------------------ display
 
     def qpos(self) -> Vector:
         """Return position, attitude and joint angles (19,)."""

@@ -192,9 +192,6 @@ def _kicker(made: Robot) -> Kicker | None:
     return Kicker(made.backend, TICK, one_push(math.nan, 0.0, 0.0)) if floats else None
 
 
-# ---------------------------------------------------------------------- the page's side
-
-
 class Link(Protocol):
     """Connection of the page to a robot."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, cast
@@ -20,23 +19,11 @@ from go1exp.base.tensors.rotation import rotate_inverse
 from go1exp.deploy.sim_robot.machine import TICK, Body
 from go1exp.deploy.sim_robot.server import TRUTH
 from go1exp.evaluate.viewer import requests as ask
-from go1exp.evaluate.viewer.drive_window import PUSH_KEY, SLOW
 from go1exp.evaluate.viewer.requests import catalogue, lines
 from go1exp.evaluate.viewer.session import PUSH_SHOWN_S, SPAN, History, PushMade
 from go1exp.evaluate.viewer.sim_process import FORCE, ROW_S, TORQUE, Frame, Link
 from go1exp.evaluate.viewer.walk import Series, Timed, push_arrow, runs_of
-from go1exp.evaluate.viewer.window import (
-    MESSAGE_LINES,
-    PLAIN,
-    Curves,
-    EffectsPanel,
-    PushPanel,
-    Vec2,
-    Window,
-    arrow_shape,
-    paragraph,
-    section,
-)
+from go1exp.evaluate.viewer.window import MESSAGE_LINES, PLAIN, SLOW, LiveWindow, Vec2, paragraph, section
 from go1exp.sim.env.camera import Stage
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.terrain import build_terrain
@@ -45,9 +32,7 @@ LOOK_S = 1.0 / 30.0  # period at which the robot is looked at, s
 
 Array = NDArray[np.float64]
 
-WIDTHS = {"height": 1, "velocity": 3, "torque": 12, "contact": 4}
-"""Columns of the curves."""
-
+WIDTHS = {"height": 1, "velocity": 3, "torque": 12, "contact": 4}  # columns of the curves
 MOST_POINTS = 1000  # most intervals that are drawn: of a faster client the longest of each group
 
 
@@ -202,24 +187,8 @@ LEAST_MS = 5.0  # the axis of the intervals reaches at least as far, ms
 BEHIND_S = 0.001  # time behind real time from which the panel reports it, s
 
 
-class SimWindow(Window):
-    """Panels of a robot that an external client commands; ``places`` as of ``DriveWindow``."""
-
-    def __init__(self) -> None:
-        super().__init__("Robot", "Curves")
-        self._push, self._effects = PushPanel(self.ask), EffectsPanel(self.ask)
-        self._plots, self.places = Curves(), self._push.places
-
-    def keys(self) -> None:
-        """Answer keys."""
-        if imgui.IsKeyPressed(PUSH_KEY, False):
-            self._push.push()
-        if imgui.IsKeyPressed(imgui.Key.Backspace, False):
-            self.ask(ask.Reset())
-
-    def scene(self) -> Iterable[Any]:
-        """Return the arrow of a push."""
-        return [arrow_shape(arrow) for arrow in self.view.arrows]
+class SimWindow(LiveWindow):
+    """Panels of a robot that an external client commands."""
 
     def left(self) -> None:
         """Draw the panels."""
@@ -239,9 +208,9 @@ class SimWindow(Window):
         if section("Client"):
             self._client(view)
         if section("Push"):
-            self._push.draw()
+            self.push_panel()
         if section("Effects", is_open=False):
-            self._effects.draw(frame.sizes, view.known)
+            self.effects_panel(frame.sizes, view.known)
 
     def _client(self, view: SimView) -> None:
         frame = view.frame
@@ -271,8 +240,8 @@ class SimWindow(Window):
             self._intervals(view)
         if section("True velocity"):
             lines = list(zip(("forward m/s", "left m/s", "yaw rad/s"), view.velocity, strict=True))
-            self._plots.plot("##velocity", "", view, lines, (-1.5, 1.5))
-        self._plots.body(view)
+            self.plot("##velocity", "", lines, (-1.5, 1.5))
+        self.body_curves()
 
     def _intervals(self, view: SimView) -> None:
         if not implot.BeginPlot("##intervals", Vec2(-1.0, PACKETS), PLAIN | int(implot.Flags.NoTitle)):

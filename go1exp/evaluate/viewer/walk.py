@@ -19,9 +19,7 @@ from go1exp.sim.env.camera import ARROW_SCALE, COMMAND_RGB, LEAST_DRAWN, MEASURE
 VIEWS_PER_S = 25.0  # rate at which the panels get new curves, Hz
 PAUSED_S = 0.02  # time between two calls while paused, s
 
-PUSH_RGB, PUSH_SCALE = (1.0, 0.35, 0.2), 0.012
-"""Colour of the arrow of a push; its length per impulse, m / (N s)."""
-
+PUSH_RGB, PUSH_SCALE = (1.0, 0.35, 0.2), 0.012  # colour of the arrow of a push; its length per impulse, m / (N s)
 FALLBACK = ((-1.5, 2.0), (-1.0, 1.0), (-1.5, 1.5))  # range of the sliders of a run without trained ranges
 RANGES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")  # parameters of a command term that are ranges of velocity
 CURVE_POINTS = 250  # points of a curve: about one a pixel
@@ -75,7 +73,6 @@ class WalkView(Timed):
     pace: ask.Pace
     achieved: float  # simulated seconds per second
     time: float  # simulated s
-    falls: int
     message: str
     physics_dt: float  # step in force, s
     command_curves: Series
@@ -126,8 +123,6 @@ class WalkShow:
         self._speed += (1.0 - math.exp(-s.dt / VELOCITY_TIME)) * (self._stage.data.qvel[:2] - self._speed)
         return s.dt / s.speed
 
-    # ------------------------------------------------------------------ content of the panels
-
     def view(self) -> WalkView | None:
         """Return the content of the panels, at most ``VIEWS_PER_S`` times a second."""
         now = time.perf_counter()
@@ -152,7 +147,6 @@ class WalkShow:
             pace=ask.Pace(s.paused, s.speed),
             achieved=self._pace(now),
             time=s.time,
-            falls=s.falls,
             message=s.message,
             physics_dt=s.core.task.sim.physics_dt,
             t=h.times(every).tolist(),

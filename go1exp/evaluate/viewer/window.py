@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -18,13 +18,11 @@ from go1exp import robot
 from go1exp.evaluate.viewer import requests as ask
 from go1exp.evaluate.viewer.requests import LARGEST
 from go1exp.evaluate.viewer.session import SPAN
-from go1exp.evaluate.viewer.walk import Arrow, Reward, Timed, WalkView
+from go1exp.evaluate.viewer.walk import Arrow, Timed
 from go1exp.evaluate.viewer.web import Ask, Shown
 from go1exp.sim.env.camera import AZIMUTH, DISTANCE, ELEVATION
 
-LEFT, RIGHT = 0.23, 0.42
-"""Width of the panels: the left one's share of the window, and the right one's of what is left."""
-
+LEFT, RIGHT = 0.23, 0.42  # width of the panels: the left one's share of the window, and the right one's of what is left
 ARROW_WIDTH = 0.013  # m
 
 Vec2 = imgui.Vec2
@@ -39,8 +37,6 @@ class Window(plugin.ViewerPlugin):
         self.follow, self._left, self._right = True, *panels
         self._docked = self._looking = False
         self._ux = ux.UxState()
-
-    # ------------------------------------------------------------------ to be overridden
 
     def left(self) -> None:
         """Fill the left panel."""
@@ -60,8 +56,6 @@ class Window(plugin.ViewerPlugin):
     def sight(self) -> tuple[Any, float]:
         """Return the camera's first target relative to the robot, m, and its distance, relative to that of a clip."""
         return np.zeros(3), 1.6
-
-    # ------------------------------------------------------------------ messages
 
     def ask(self, request: Any) -> None:
         """Send a request of the user."""
@@ -158,19 +152,48 @@ def section(label: str, is_open: bool = True) -> bool:
     return bool(imgui.CollapsingHeader(label, flags))
 
 
-class PushPanel:
-    """Impulse, direction and button of a push; ``places`` has the button's left, top, right, bottom, pixels."""
+PLOT, TALL, ROW = 110.0, 250.0, 15.0  # height of a plot, of one with a line for each joint, of a leg's contacts, pixels
+PLAIN = int(implot.Flags.NoMenus) | int(implot.Flags.NoBoxSelect) | int(implot.Flags.NoMouseText)
+FOOT, PUSHED = imgui.Vec4(0.45, 0.7, 1.0, 1.0), imgui.Vec4(1.0, 0.45, 0.2, 0.8)
+SLOW = imgui.Vec4(1.0, 0.7, 0.3, 1.0)
 
-    def __init__(self, send: Callable[[ask.Push], None]) -> None:
-        self._send, self._impulse, self._direction = send, 20.0, 90.0
+Line = tuple[str, Sequence[float]]
+
+
+class LiveWindow(Window):
+    """Base of the windows of a robot that moves: pushes, effects, arrows and curves.
+
+    ``places`` of controls on the page are left, top, right, bottom, pixels.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("Robot", "Curves")
+        self._impulse, self._direction = 20.0, 90.0
+        self._drafts: dict[str, float] = {}  # values of sliders that are not released yet
         self.places: dict[str, tuple[float, float, float, float]] = {}
+
+    def keys(self) -> None:
+        """Push by P, reset by Backspace."""
+        if imgui.IsKeyPressed(imgui.Key.P, False):
+            self.push()
+        if imgui.IsKeyPressed(imgui.Key.Backspace, False):
+            self.ask(ask.Reset())
+
+    def scene(self) -> Iterable[Any]:
+        """Return the arrows."""
+        return [arrow_shape(arrow) for arrow in self.view.arrows]
+
+    def note(self, name: str) -> None:
+        """Note the place of the last control."""
+        low, high = imgui.GetItemRectMin(), imgui.GetItemRectMax()
+        self.places[name] = (low.x, low.y, high.x, high.y)
 
     def push(self) -> None:
         """Push by the sliders' values."""
-        self._send(ask.Push(self._impulse, math.radians(self._direction)))
+        self.ask(ask.Push(self._impulse, math.radians(self._direction)))
 
-    def draw(self) -> None:
-        """Draw sliders and button."""
+    def push_panel(self) -> None:
+        """Draw impulse, direction and button of a push."""
         imgui.SetNextItemWidth(-85.0)
         _, self._impulse = imgui.SliderFloat("N s", self._impulse, 0.0, 60.0, "%.0f")
         imgui.SetNextItemWidth(-85.0)
@@ -178,119 +201,61 @@ class PushPanel:
         imgui.SetItemTooltip("direction relative to the heading: 0 forward, 90 left")
         if imgui.Button("Push (P)", Vec2(-1.0, 0.0)):
             self.push()
-        low, high = imgui.GetItemRectMin(), imgui.GetItemRectMax()
-        self.places["push"] = (low.x, low.y, high.x, high.y)
+        self.note("push")
 
-
-class ReleasedSlider:
-    """Sliders whose value is sent when they are released: the request takes time."""
-
-    def __init__(self) -> None:
-        self._draft: dict[str, float] = {}
-
-    def draw(self, label: str, now: float, high: float, shown: str, width: float = -85.0) -> float | None:
-        """Draw a slider from 0; return its value when it is released after a change."""
+    def released_slider(self, label: str, now: float, high: float, shown: str, width: float = -85.0) -> float | None:
+        """Draw a slider from 0; return its value when it is released after a change: the request takes time."""
         imgui.SetNextItemWidth(width)
-        changed, value = imgui.SliderFloat(label, self._draft.get(label, now), 0.0, high, shown)
+        changed, value = imgui.SliderFloat(label, self._drafts.get(label, now), 0.0, high, shown)
         if changed:
-            self._draft[label] = value
+            self._drafts[label] = value
         if imgui.IsItemDeactivatedAfterEdit():
-            return self._draft.pop(label, value)
+            return self._drafts.pop(label, value)
         if not imgui.IsItemActive():
-            self._draft.pop(label, None)
+            self._drafts.pop(label, None)
         return None
 
-
-class EffectsPanel:
-    """Each effect on or off, and its size."""
-
-    def __init__(self, send: Callable[[ask.SetEffects], None]) -> None:
-        self._send, self._slider = send, ReleasedSlider()
-
-    def draw(self, sizes: Mapping[str, float], texts: Mapping[str, str]) -> None:
+    def effects_panel(self, sizes: Mapping[str, float], texts: Mapping[str, str]) -> None:
         """Draw a checkbox and a slider for each effect of ``texts``, its description."""
         for name, text in texts.items():
             changed, on = imgui.Checkbox(f"##{name}", sizes.get(name, 0.0) > 0.0)
             if changed:
-                self._send(ask.SetEffects({**sizes, name: 1.0 if on else 0.0}))
+                self.ask(ask.SetEffects({**sizes, name: 1.0 if on else 0.0}))
             imgui.SameLine()
             imgui.BeginDisabled(not sizes.get(name, 0.0) > 0.0)
-            size = self._slider.draw(name, sizes.get(name, 0.0), LARGEST, "%.2f", -130.0)
+            size = self.released_slider(name, sizes.get(name, 0.0), LARGEST, "%.2f", -130.0)
             imgui.EndDisabled()
             imgui.SetItemTooltip(text)
             if size is not None:
-                self._send(ask.SetEffects({**sizes, name: size}))
+                self.ask(ask.SetEffects({**sizes, name: size}))
 
-
-VELOCITY_AXES = (("x", "m/s"), ("y", "m/s"), ("yaw", "rad/s"))
-
-PLOT, TALL, ROW, SPARK = 110.0, 250.0, 15.0, 22.0
-"""Of a plot, of one with a line for each joint, of a leg in the contact diagram, and of a reward's curve, pixels."""
-
-PLAIN = int(implot.Flags.NoMenus) | int(implot.Flags.NoBoxSelect) | int(implot.Flags.NoMouseText)
-
-GOOD, BAD, FOOT, PUSHED = (
-    imgui.Vec4(0.35, 0.75, 0.4, 0.9),
-    imgui.Vec4(0.9, 0.4, 0.3, 0.9),
-    imgui.Vec4(0.45, 0.7, 1.0, 1.0),
-    imgui.Vec4(1.0, 0.45, 0.2, 0.8),
-)
-
-Line = tuple[str, Sequence[float]]
-
-
-class Curves:
-    """The panel of curves."""
-
-    def draw(self, view: WalkView) -> None:
-        """Draw all sections that are unfolded."""
-        if section("Velocity: commanded, true, estimated"):
-            self._velocity(view)
-        self.body(view)
-        if section(f"Rewards: {len(view.rewards)} terms, {view.total:+.2f} per s"):
-            self._rewards(view.rewards)
-
-    def body(self, view: Timed) -> None:
+    def body_curves(self) -> None:
         """Draw the sections of contacts, height and torque."""
+        view: Timed = self.view
         if section("Contacts"):
-            self.contacts(view)
+            self._contacts(view)
         if section("Trunk height"):
-            self.plot("##height", "m", view, [("height", view.height)], (0.0, 0.5))
+            self.plot("##height", "m", [("height", view.height)], (0.0, 0.5))
         if section("Torque / limit"):
             lines = list(zip(robot.JOINTS, view.torque, strict=False))
-            self.plot("##torque", "-", view, lines, (0.0, 1.05), TALL)
+            self.plot("##torque", "-", lines, (0.0, 1.05), tall=True)
 
-    def _velocity(self, view: WalkView) -> None:
-        for axis, (name, unit) in enumerate(VELOCITY_AXES):
-            lines: list[Line] = [("estimated", view.estimated[axis])] if view.estimated else []
-            lines += [("commanded", view.command_curves[axis]), ("true", view.true[axis])]  # the last one lies on top
-            low, high = view.limits[axis]
-            self.plot(f"##{name}", f"{name}  {unit}", view, lines, (low, high))
-
-    def plot(
-        self,
-        label: str,
-        unit: str,
-        view: Timed,
-        lines: Sequence[Line],
-        reach: tuple[float, float],
-        height: float = PLOT,
-    ) -> None:
+    def plot(self, key: str, unit: str, lines: Sequence[Line], reach: tuple[float, float], tall: bool = False) -> None:
         """Draw lines over the last seconds, with a mark where the robot was pushed."""
         flags = PLAIN | int(implot.Flags.NoTitle) | (int(implot.Flags.NoLegend) if len(lines) == 1 else 0)
-        if not implot.BeginPlot(label, Vec2(-1.0, height), flags):
+        if not implot.BeginPlot(key, Vec2(-1.0, TALL if tall else PLOT), flags):
             return
         implot.SetupAxes("", unit, 0, 0)
         implot.SetupAxisLimits(int(implot.Axis.X1), -SPAN, 0.0, int(implot.Cond.Always))
         implot.SetupAxisLimits(int(implot.Axis.Y1), *reach, int(implot.Cond.Once))
         implot.SetupLegend(int(implot.Location.East), int(implot.LegendFlags.Outside))
         for name, values in lines:
-            implot.PlotLine(name, view.t, values)
-        for t in view.pushes:
+            implot.PlotLine(name, self.view.t, values)
+        for t in self.view.pushes:
             implot.TagX(t, PUSHED, "push")
         implot.EndPlot()
 
-    def contacts(self, view: Timed) -> None:
+    def _contacts(self, view: Timed) -> None:
         """Draw a bar for each contact of a foot."""
         imgui.BeginGroup()
         for leg in robot.LEGS:
@@ -309,40 +274,3 @@ class Curves:
             x = corner.x + width * (1.0 + t / SPAN)
             draw.AddLine(Vec2(x, corner.y), Vec2(x, corner.y + 4 * pitch), imgui.GetColorU32(PUSHED))
         imgui.Dummy(Vec2(width, 4 * pitch))
-
-    def _rewards(self, rewards: Sequence[Reward]) -> None:
-        """Draw a row for each term: its name, its mean of the last second, a bar, and its curve."""
-        largest = max((abs(r.mean) for r in rewards), default=0.0) or 1.0
-        if not imgui.BeginTable("rewards", 4, int(imgui.TableFlags.SizingFixedFit)):
-            return
-        stretch = int(imgui.TableColumnFlags.WidthStretch)
-        for name, flags in (("term", 0), ("per s", 0), ("mean of 1 s", stretch), (f"last {SPAN:g} s", stretch)):
-            imgui.TableSetupColumn(name, flags)
-        imgui.TableHeadersRow()
-        for reward in rewards:
-            self._reward(reward, largest)
-        imgui.EndTable()
-
-    def _reward(self, reward: Reward, largest: float) -> None:
-        imgui.TableNextRow()
-        imgui.TableNextColumn()
-        imgui.TextUnformatted(reward.name)
-        imgui.TableNextColumn()
-        imgui.TextUnformatted(f"{reward.mean:+7.3f}")
-        imgui.TableNextColumn()
-        corner, width = imgui.GetCursorScreenPos(), imgui.GetContentRegionAvail().x
-        middle = corner.x + 0.5 * width
-        end = middle + 0.5 * width * reward.mean / largest
-        colour = imgui.GetColorU32(GOOD if reward.mean >= 0.0 else BAD)
-        box = Vec2(min(middle, end), corner.y + 4.0), Vec2(max(middle, end, middle + 1.0), corner.y + SPARK - 4.0)
-        imgui.GetWindowDrawList().AddRectFilled(*box, colour)
-        imgui.Dummy(Vec2(width, SPARK))
-        imgui.TableNextColumn()
-        flags = int(implot.Flags.CanvasOnly) | int(implot.Flags.NoInputs) | int(implot.Flags.NoFrame)
-        implot.PushStyleVar(int(implot.StyleVar.PlotPadding), Vec2(0.0, 1.0))  # or nothing is left of so small a plot
-        if reward.curve and implot.BeginPlot(f"##{reward.name}", Vec2(-1.0, SPARK), flags):
-            axis = int(implot.AxisFlags.NoDecorations) | int(implot.AxisFlags.AutoFit)
-            implot.SetupAxes("", "", axis, axis)
-            implot.PlotLine("value", list(range(len(reward.curve))), reward.curve)
-            implot.EndPlot()
-        implot.PopStyleVar()

@@ -17,9 +17,9 @@ from go1exp.evaluate.protocol.base import Length, Played, lives
 from go1exp.evaluate.protocol.claims import evaluated
 from go1exp.evaluate.protocol.kinds.energy import POWER, effort
 from go1exp.evaluate.protocol.kinds.rate import LATEST_MS
-from go1exp.evaluate.protocol.kinds.steady import AXES, ERRORS, Steady, by_axis
+from go1exp.evaluate.protocol.kinds.steady import ERRORS, Steady, by_axis
 from go1exp.evaluate.protocol.plan import Motion, Plan
-from go1exp.evaluate.quantities import FELL, Column, Derived, Row, add_measures
+from go1exp.evaluate.quantities import AXES, FELL, Column, Derived, Row, add_measures
 from go1exp.evaluate.quantities import summary as summarised
 
 if TYPE_CHECKING:

@@ -14,19 +14,8 @@ from go1exp.base.report import plots
 from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import NonNegative, Positive, protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import (
-    Cause,
-    Impulse,
-    Length,
-    Played,
-    Point,
-    Protocol,
-    bands,
-    lives,
-    repeated,
-    rounded,
-)
-from go1exp.evaluate.protocol.plan import Impulses, Motion, Plan, Signal
+from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, bands, lives, repeated, rounded
+from go1exp.evaluate.protocol.plan import Impulse, Impulses, Motion, Plan, Point, Signal
 from go1exp.evaluate.quantities import Column, Row
 
 if TYPE_CHECKING:

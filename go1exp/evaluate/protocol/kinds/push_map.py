@@ -14,16 +14,17 @@ from go1exp.base.report import plots
 from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import Positive, protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Cause, Count, Impulse, Length, Played, Point, Protocol, lives
-from go1exp.evaluate.protocol.plan import Impulses, Motion, Plan, Signal
-from go1exp.evaluate.quantities import Column, Derived, Row, values
+from go1exp.evaluate.protocol.base import Cause, Count, Length, Played, Protocol, lives
+from go1exp.evaluate.protocol.plan import Impulse, Impulses, Motion, Plan, Point, Signal
+from go1exp.evaluate.quantities import Column, Derived, Row, by_condition, values
 
 if TYPE_CHECKING:
-    from go1exp.evaluate.protocol.stage import Session, Stage
+    from go1exp.evaluate.protocol.stage import Stage
 
 Array = NDArray[np.float64]
 
 LONGEST_STRIDE = 0.6  # time after the start in which two touchdowns of FR are looked for, twice, s
+LOOK_S = 2 * LONGEST_STRIDE  # time after settling in which the latest kick begins, s
 LEAST_SWING = 0.05  # s
 GUESS = 0.36  # stride of a robot that shows none, s
 LEAST_SETTLE, LEAST_WATCH = 1.0, 0.5  # shortest times before and after a kick, s
@@ -72,28 +73,23 @@ class PushMap(Protocol):
         """All robots: ``robots`` in each direction and phase."""
         return self.directions * self.phases * self.robots
 
-    @property
-    def _look_s(self) -> float:
-        """Time after settling in which the latest kick begins, s."""
-        return 2 * LONGEST_STRIDE
-
     def lengths(self) -> list[Length]:
         """Return that of the walk and one kick: those that follow begin where the first did."""
-        settle, look, watch = self.settle_s, self._look_s, self.watch_s
+        settle, watch = self.settle_s, self.watch_s
         causes = [
-            Cause("settle_s", settle, LEAST_SETTLE, lambda seconds: seconds - look - watch),
-            Cause("watch_s", watch, LEAST_WATCH, lambda seconds: seconds - look - settle),
+            Cause("settle_s", settle, LEAST_SETTLE, lambda seconds: seconds - LOOK_S - watch),
+            Cause("watch_s", watch, LEAST_WATCH, lambda seconds: seconds - LOOK_S - settle),
         ]
-        return [Length(settle + look + watch, self.count, causes)]
+        return [Length(settle + LOOK_S + watch, self.count, causes)]
 
     def steps(self, stage: Stage) -> float:
         """Return policy steps times robots."""
-        trial = stage.steps(self._look_s + self.watch_s)
+        trial = stage.steps(LOOK_S + self.watch_s)
         return (stage.steps(self.settle_s) + (2 + self.halvings) * trial) * self.count
 
     def play(self, stage: Stage) -> Played:
         """Let all walk once; from where they are then, kick them again and again, each in its own phase."""
-        t = stage.times(self.settle_s + self._look_s + self.watch_s)
+        t = stage.times(self.settle_s + LOOK_S + self.watch_s)
         command = np.repeat(self.command.at(t)[:, None], self.count, 1)
         nothing = np.zeros((self.count, 1))
         session = stage.session(Plan(command, impulses=Impulses(nothing, nothing, nothing, self.push_s, self.point)))
@@ -108,33 +104,24 @@ class PushMap(Protocol):
         angle = 2.0 * np.pi * direction / self.directions
 
         def survives(impulse: Array) -> NDArray[np.bool_]:
-            kicks = Impulses(start[:, None], impulse[:, None], angle[:, None], self.push_s, self.point)
-            return self._trial(session, state, settle, kicks, start, len(t) - settle)
+            session.load(state, settle)
+            session.use(Impulses(start[:, None], impulse[:, None], angle[:, None], self.push_s, self.point))
+            motion = session.run(len(t) - settle)
+            end = np.round((start + self.watch_s - motion.t[0]) / motion.dt).astype(int)
+            return motion.alive[np.clip(end, 0, len(motion.alive) - 1), robot]
 
         figures = largest_survived(survives, self.count, self.largest, self.halvings)
         rows, later = lives(walked), lives(unkicked)
         for n, row in enumerate(rows):
             up = bool(unkicked.alive[-1, n])
-            row |= {
-                "direction_deg": float(np.degrees(angle[n])),
-                "robot": int(phase[n] * self.robots + n % self.robots),
-            }
+            number = int(phase[n] * self.robots + n % self.robots)
+            row |= {"direction_deg": float(np.degrees(angle[n])), "robot": number}
             row |= {"phase": float(phase[n] / self.phases), "fell": not up and not unkicked.left_map[n]}
             row["moving_s"] += later[n]["moving_s"]
             row["impulse"] = float(figures[n]) if up else None
         censored = int((figures >= self.largest).sum())
         notes = [f"{censored} robots withstood the largest impulse of {self.largest:g} N s: their limit may be larger."]
         return Played(rows, {}, notes if censored else [])
-
-    def _trial(
-        self, session: Session, state: Any, settle: int, kicks: Any, start: Array, steps: int
-    ) -> NDArray[np.bool_]:
-        """Return which robots still stand ``watch_s`` after their kick."""
-        session.load(state, settle)
-        session.use(kicks)
-        motion = session.run(steps)
-        end = np.round((start + self.watch_s - motion.t[0]) / motion.dt).astype(int)
-        return motion.alive[np.clip(end, 0, steps - 1), np.arange(self.count)]
 
     def derived(self, rows: Sequence[Row]) -> list[Derived]:
         """Return median and 10th percentile of each direction, and the area within the medians."""
@@ -202,10 +189,8 @@ def _percentile(rows: Sequence[Row], percent: float) -> float:
 
 
 def _medians(rows: Sequence[Row]) -> Array:
-    by: dict[float, list[Row]] = {}
-    for row in rows:
-        by.setdefault(row["direction_deg"], []).append(row)
-    return np.array([_percentile(by[angle], 50.0) for angle in sorted(by)])
+    directions = by_condition(rows, ("direction_deg",))
+    return np.array([_percentile(directions[angle], 50.0) for angle in sorted(directions)])
 
 
 def _area(rows: Sequence[Row]) -> float:
@@ -253,9 +238,8 @@ def _phases(rows: Sequence[Row]) -> plots.Figure:
     defined = [e for e in each if len(e)]
     ax = axes[0, 0]
     if defined:
-        plots.band(
-            ax, at, [np.quantile(e, 0.1) for e in defined], [np.quantile(e, 0.9) for e in defined], plots.MEASURED
-        )
+        low, high = ([np.quantile(e, share) for e in defined] for share in (0.1, 0.9))
+        plots.band(ax, at, low, high, plots.MEASURED)
         ax.plot(at, [np.median(e) for e in defined], "-o", ms=3.5, color=plots.MEASURED)
     ax.set(xlabel="phase of FR (cycles)", ylabel="impulse (N s)")
     ax.set_ylim(bottom=0.0)

@@ -14,26 +14,25 @@ from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import Positive, protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, bands, lives, repeated, rounded
+from go1exp.evaluate.protocol.kinds.steady import ERRORS
 from go1exp.evaluate.protocol.plan import Motion, Plan, Sine, response
-from go1exp.evaluate.quantities import Column, Row
+from go1exp.evaluate.quantities import AXES, Column, Row
 
 if TYPE_CHECKING:
     from go1exp.evaluate.protocol.stage import Stage
 
-AXES = ("x", "y", "yaw")
 EVERY = 4  # of so many steps one is kept for drawings
 
-
-def _columns() -> tuple[Column, ...]:
-    collected = []
-    for axis, unit in zip(AXES, ("m/s", "m/s", "rad/s"), strict=True):
-        collected += [
-            Column(f"gain_{axis}", "", f"amplitude of {axis} over that of its command"),
-            Column(f"lag_{axis}", "s", f"time by which {axis} comes after its command", better="lower"),
-            Column(f"coherence_{axis}", "", f"how alike the periods of {axis} are", better="higher"),
-            Column(f"rmse_{axis}", unit, f"root mean square error of {axis}, gait included", better="lower"),
-        ]
-    return tuple(collected)
+FIGURES = tuple(
+    column
+    for axis, error in zip(AXES, ERRORS, strict=True)
+    for column in (
+        Column(f"gain_{axis}", "", f"amplitude of {axis} over that of its command"),
+        Column(f"lag_{axis}", "s", f"time by which {axis} comes after its command", better="lower"),
+        Column(f"coherence_{axis}", "", f"how alike the periods of {axis} are", better="higher"),
+        error,
+    )
+)
 
 
 @protocol("sinusoid")
@@ -50,7 +49,7 @@ class Sinusoid(Protocol):
     ladder: Annotated[tuple[Sine, ...], Field(min_length=1)]
 
     keys: ClassVar[tuple[str, ...]] = ("amplitude", "period")
-    robot_columns: ClassVar[tuple[Column, ...]] = _columns()
+    robot_columns: ClassVar[tuple[Column, ...]] = FIGURES
 
     def __post_init__(self) -> None:
         if self.seconds < 2.0 * self.longest:

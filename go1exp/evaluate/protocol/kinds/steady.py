@@ -12,12 +12,10 @@ from go1exp.config.schema.registry import NonNegative, Positive
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, lives, repeated
 from go1exp.evaluate.protocol.plan import Constant, Motion, Plan, Velocity
-from go1exp.evaluate.quantities import Column, Row, add_measures
+from go1exp.evaluate.quantities import AXES, Column, Row, add_measures
 
 if TYPE_CHECKING:
     from go1exp.evaluate.protocol.stage import Stage
-
-AXES = ("x", "y", "yaw")
 
 ERRORS = tuple(
     Column(f"rmse_{axis}", unit, f"root mean square error of {axis}, gait included", better="lower")
