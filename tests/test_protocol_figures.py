@@ -15,7 +15,7 @@ from go1exp import robot
 from go1exp.config.compose import compose
 from go1exp.evaluate.protocol.base import chosen
 from go1exp.evaluate.protocol.claims import Claim, evaluated, verdict
-from go1exp.evaluate.protocol.ground import COURSE, RESOLUTION, RUN_UP, SHAPES, TREAD, UNITS, Lanes, goal
+from go1exp.evaluate.protocol.ground import COURSE, GOAL, RESOLUTION, RUN_UP, SHAPES, TREAD, UNITS, Lanes
 from go1exp.evaluate.protocol.kinds import energy, gait, hardware, push_map, rate, terrain
 from go1exp.evaluate.protocol.plan import Constant, Impulses, Kicker, Motion, Sine, Steps, heading, phasors, response
 from go1exp.evaluate.protocol.stage import delay_of_effects
@@ -155,7 +155,7 @@ def test_time_under_a_command_ends_with_the_fall() -> None:
 def profile(lanes: Lanes, lane: int) -> tuple[np.ndarray, np.ndarray]:
     """Distance from the start, and height, along the middle of a lane."""
     terrain = build_terrain(lanes)
-    x = np.arange(0.0, goal(), RESOLUTION / 2)
+    x = np.arange(0.0, GOAL, RESOLUTION / 2)
     y = terrain.tile_origins[0, lane, 1]
     return x, terrain.height_at(np.stack([x, np.full_like(x, y)], 1))
 
@@ -193,7 +193,7 @@ def test_every_lane_starts_on_flat_ground_and_its_end_is_on_the_map() -> None:
         terrain = build_terrain(Lanes(ground=ground, levels=(0.05, 0.1, 0.2)))  # type: ignore[arg-type]
         assert terrain.tile_origins.shape == (1, 3, 3)
         assert (terrain.tile_origins[..., 2] == 0.0).all()
-        assert terrain.extent[1] - 1.0 > goal() + 0.5  # starts differ by half a metre
+        assert terrain.extent[1] - 1.0 > GOAL + 0.5  # starts differ by half a metre
         assert terrain.extent[0] + 1.0 <= -0.5
 
 

@@ -99,7 +99,7 @@ def evaluate(
     ``settle_s``: ``mean`` velocity, ``rmse`` against the command, per axis. ``on_step`` is called with the progress.
     ``controller`` makes what moves one robot in place of the policy, by its own sensors.
     ``measures`` (``go1exp/mdp/measures``) are over the same time and over robots that differ: ``distinct`` of them.
-    ``rows`` has one entry for each robot (``rows.py``), for a file of its own.
+    ``rows`` has one entry for each robot, for a file of its own.
     ``agreement`` has the differences of another engine from MuJoCo, checked first: raise Expected if they are too
     large, TooLongError if what measures need does not fit into memory, ConfigError if ``settle_s`` leaves no step.
     """

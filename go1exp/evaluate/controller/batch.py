@@ -16,7 +16,7 @@ from go1exp.base.tensors.rotation import rotate_inverse
 from go1exp.config.schema.registry import ConfigError
 from go1exp.deploy.estimation import Filters
 from go1exp.deploy.sim_robot.machine import noisy
-from go1exp.evaluate.controller.types import Command, Controller, Savable, Sensed, TrunkVelocity
+from go1exp.evaluate.controller.types import Controller, Savable, Sensed, TrunkVelocity
 from go1exp.logs.record.simulate import sample
 from go1exp.robot.messages import LowCmd
 from go1exp.sim.env.core import Go1Core
@@ -101,12 +101,9 @@ class Driven:
     def _step(self) -> None:
         sensed = self._sense()
         if self._steps % self._every == 0:
-            commands = self._core.command.value.double().numpy()
-            applied = [
-                one.step(_command(row), of_robot)
-                for one, row, of_robot in zip(self.controllers, commands, sensed, strict=True)
-            ]
-            self._apply(applied)
+            commands = self._core.command.value.double().tolist()
+            each = zip(self.controllers, commands, sensed, strict=True)
+            self._apply([one.step((x, y, yaw), of_robot) for one, (x, y, yaw), of_robot in each])
         self._steps += 1
         self._plant.step(self._target, self._forward if self._feeds else None)
         self._core.target.copy_(self._target)
@@ -136,10 +133,6 @@ class Driven:
         names = ("q", "qd", "quat", "gyro")
         rows = zip(*(readings[name] for name in names), velocities, readings["foot_force"], strict=True)
         return [Sensed(*row) for row in rows]
-
-
-def _command(row: np.ndarray) -> Command:
-    return float(row[0]), float(row[1]), float(row[2])
 
 
 def _whole(period: float, dt: float) -> int:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field
 
 from go1exp import robot
 from go1exp.base.report.plots import Drawing
-from go1exp.config.schema.registry import ConfigError, Term, bind_list, find, members, unknown_name
+from go1exp.config.schema.registry import ConfigError, Count, Term, bind_list, find, members, unknown_name
 from go1exp.config.schema.settings import parse, settings
 from go1exp.evaluate.controller.types import TrunkVelocity
 from go1exp.evaluate.protocol.claims import Claim
@@ -22,8 +21,6 @@ from go1exp.mdp.measures import measured
 
 if TYPE_CHECKING:
     from go1exp.evaluate.protocol.stage import Stage
-
-Count = Annotated[int, Field(ge=1)]
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ UNITS: dict[str, str] = {
 RUN_UP, COURSE, RUN_OUT, WIDTH = 1.5, 5.0, 2.5, 5.0
 """m. The run-out is longer than the metre before the edge of the map at which an episode ends."""
 
+GOAL = RUN_UP + COURSE + 0.5  # way along its lane that a robot must come, m: to half a metre beyond the difficulty
 BEFORE = 2.0  # flat ground behind the start, m
 RESOLUTION = 0.05  # pitch of the samples, m: that of the gravel
 TREAD = 0.31  # depth of a stair, m (legged_gym)
@@ -37,9 +38,8 @@ Field = NDArray[Any]
 
 
 def _slope(x: Field, y: Field, difficulty: float, rng: np.random.Generator) -> Field:
-    return np.broadcast_to(
-        np.tan(np.radians(difficulty)) * np.clip(x, 0.0, COURSE), np.broadcast_shapes(x.shape, y.shape)
-    )
+    rise = np.tan(np.radians(difficulty)) * np.clip(x, 0.0, COURSE)
+    return np.broadcast_to(rise, np.broadcast_shapes(x.shape, y.shape))
 
 
 def _stairs(x: Field, y: Field, difficulty: float, rng: np.random.Generator) -> Field:
@@ -104,8 +104,3 @@ class Lanes(TerrainConfig):
         origins[0, :, 1] = y0 + (margin + (np.arange(len(self.levels)) + 0.5) * per_lane) * RESOLUTION
         kinds = (self.ground,) * len(self.levels)
         return Terrain(as_stored(heights), -BEFORE, y0, RESOLUTION, origins, kinds, self)
-
-
-def goal() -> float:
-    """Return how far along its lane a robot must come, m: half a metre beyond the end of the difficulty."""
-    return RUN_UP + COURSE + 0.5

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from go1exp.config.schema.physics import BackendConfig, fitting_step
 from go1exp.config.schema.registry import Entry, Term, members
+from go1exp.config.schema.settings import subset
 from go1exp.evaluate.agents import Agent, Progress
 from go1exp.evaluate.controller.types import TrunkVelocity
 from go1exp.evaluate.protocol.plan import STEP_BYTES, Array, Impulses, Kicker, Motion, Plan, heading
@@ -100,17 +101,9 @@ class Stage:
         """Return the environment of a plan."""
         setting, of_agent = self.setting, self.agent.task
         policy_dt = plan.policy_dt or self.policy_dt
-        config = EvalConfig(
-            commands=(),
-            episodes=plan.robots,
-            seconds=len(plan.command) * policy_dt,
-            noise=setting.noise,
-            randomize=setting.randomize,
-            policy_dt=policy_dt,
-            seed=setting.seed,
-            physics_dt=self.physics_dt(policy_dt),
-            engine=setting.engine,
-        )
+        seconds, physics_dt = len(plan.command) * policy_dt, self.physics_dt(policy_dt)
+        times = {"seconds": seconds, "policy_dt": policy_dt, "physics_dt": physics_dt}
+        config = subset(EvalConfig, setting, commands=(), episodes=plan.robots, **times)
         command = Term("command", Entry("command", "scheduled", _Scheduled), {})
         task = dataclasses.replace(evaluation_task(of_agent, config), terrain=plan.ground, command=command)
         if plan.friction is not None:

@@ -6,11 +6,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from go1exp.config.schema.registry import Duration, NonNegative
+from go1exp.config.schema.registry import Count, Duration, NonNegative
 from go1exp.config.schema.settings import settings
 
 Name = Annotated[str, Field(min_length=1)]
-Count = Annotated[int, Field(ge=1)]
 
 
 @settings

@@ -49,7 +49,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Absent:
-    """A run or job that is excluded: its name, its state, and the reason."""
+    """A run or job without results, or that is excluded: its name, its state, and the reason."""
 
     label: str
     state: str
@@ -74,34 +74,29 @@ class Group:
     runs: list[Run]
 
 
-@dataclass(frozen=True)
-class _Job:
-    name: str
-    state: str
-    cause: str
-    folder: Path
-
-
 def study(folders: Sequence[str], unfinished: bool) -> Study:
     """Return the runs below ``folders``, each once; those not done if ``unfinished``; raise ConfigError without any."""
     given = [Path(folder) for folder in folders]
     if missing := [f"folders: {str(f)!r}: {_no_folder(f)}" for f in given if not f.is_dir()]:
         raise ConfigError(missing)
-    jobs: dict[Path, _Job] = {}
+    jobs: dict[Path, Absent] = {}  # jobs of sweeps by their run folders
     notes: list[str] = []
     places: dict[Path, Path] = {}  # resolved -> as the user would name it
     empty = []
     for folder in given:
         below = list(_below(folder, jobs, notes))
         places |= {place.resolve(): place for place in below if place.resolve() not in places}
-        if not below and not any(job.folder.is_relative_to(folder.resolve()) for job in jobs.values()):
+        if not below and not any(place.is_relative_to(folder.resolve()) for place in jobs):
             empty.append(f"folders: {str(folder)!r}: there is no run in it (no folder with config.yaml)")
     if empty:
         raise ConfigError(empty)
     runs, absent = _read(places, jobs)
-    waiting = [j for j in jobs.values() if j.folder not in places]
-    absent = [Absent(j.name or j.folder.name, j.state, j.cause or "has no run folder yet") for j in waiting] + absent
-    return _included(runs, absent, list(dict.fromkeys(notes)), unfinished)
+    waiting = [
+        Absent(job.label or place.name, job.state, job.cause or "has no run folder yet")
+        for place, job in jobs.items()
+        if place not in places
+    ]
+    return _included(runs, waiting + absent, list(dict.fromkeys(notes)), unfinished)
 
 
 def _no_folder(place: Path) -> str:
@@ -110,31 +105,31 @@ def _no_folder(place: Path) -> str:
     return "is a file; give a run folder (with config.yaml), a sweep, or a folder above them, such as runs"
 
 
-def _below(folder: Path, jobs: dict[Path, _Job], notes: list[str]) -> Iterator[Path]:
+def _below(folder: Path, jobs: dict[Path, Absent], notes: list[str]) -> Iterator[Path]:
     """Yield the run folders in and below a folder; collect the jobs of sweeps, and notes on damaged indices."""
     for place, below, files in os.walk(folder):
         path = Path(place)
         if SWEEP in files:
-            jobs.update({job.folder: job for job in _jobs(path, notes)})
+            jobs.update(_jobs(path, notes))
         if "config.yaml" in files:
             yield path
             below.clear()
         below[:] = sorted(name for name in below if not name.startswith("."))
 
 
-def _jobs(sweep: Path, notes: list[str]) -> Iterator[_Job]:
-    """Yield the jobs of a sweep's index; of a damaged one those before the damage, with a note."""
+def _jobs(sweep: Path, notes: list[str]) -> Iterator[tuple[Path, Absent]]:
+    """Yield run folder and job of a sweep's index; of a damaged one those before the damage, with a note."""
     try:
         for job in json.loads((sweep / SWEEP).read_text())["jobs"]:
-            folder = (sweep / job["run_folder"]).resolve()
-            yield _Job(str(job["name"]), str(job["state"]), str(job.get("cause", "")), folder)
+            made = Absent(str(job["name"]), str(job["state"]), str(job.get("cause", "")))
+            yield (sweep / job["run_folder"]).resolve(), made
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:100]}"
         lost = "names of jobs, and jobs without a run folder, are unknown"
         notes.append(f"{sweep / SWEEP}: is damaged ({reason}); {lost}")
 
 
-def _read(places: dict[Path, Path], jobs: dict[Path, _Job]) -> tuple[list[Run], list[Absent]]:
+def _read(places: dict[Path, Path], jobs: dict[Path, Absent]) -> tuple[list[Run], list[Absent]]:
     labels = _labels(list(places))
     damaged, runs = [], []
     for place, shown in places.items():
@@ -149,7 +144,7 @@ def _read(places: dict[Path, Path], jobs: dict[Path, _Job]) -> tuple[list[Run], 
         state: str = known.state
         if state == "not started" and (place / "metrics.csv").is_file():
             state = "done" if job is None else job.state  # written by a version without a state file
-        runs.append(Run(place, labels[place], config, seed, state, known.cause, job.name if job else ""))
+        runs.append(Run(place, labels[place], config, seed, state, known.cause, job.label if job else ""))
     return runs, damaged
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,10 +42,14 @@ def spearman(x: ArrayLike, y: ArrayLike) -> tuple[float, float]:
         scaled = (drawn - drawn.mean(axis=axis, keepdims=True)) / a.std()
         return np.asarray((scaled * centred).sum(axis=axis))
 
-    test = scipy.stats.permutation_test(
-        (a,), statistic, permutation_type="pairings", vectorized=True, n_resamples=RESAMPLES, rng=0
-    )
+    test = _permuted(a, statistic, "two-sided")
     return float(test.statistic), float(test.pvalue)
+
+
+def _permuted(values: NDArray[np.float64], statistic: Callable[..., NDArray[np.float64]], alternative: str) -> Any:
+    """Return SciPy's permutation test of ``statistic`` over the pairings of ``values`` (n,)."""
+    options = {"permutation_type": "pairings", "vectorized": True, "n_resamples": RESAMPLES, "rng": 0}
+    return scipy.stats.permutation_test((values,), statistic, alternative=alternative, **options)
 
 
 def explained_by_names(names: ArrayLike, y: ArrayLike) -> float:
@@ -61,16 +65,7 @@ def explained_by_names(names: ArrayLike, y: ArrayLike) -> float:
         means = np.moveaxis(drawn, axis, -1) @ member / counts
         return np.asarray((counts * means**2).sum(-1))
 
-    test = scipy.stats.permutation_test(
-        (values,),
-        between,
-        permutation_type="pairings",
-        vectorized=True,
-        n_resamples=RESAMPLES,
-        rng=0,
-        alternative="greater",
-    )
-    return float(test.pvalue)
+    return float(_permuted(values, between, "greater").pvalue)
 
 
 def associations(quantities: Mapping[str, ArrayLike], figure: ArrayLike) -> list[Association]:

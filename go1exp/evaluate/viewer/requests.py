@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 from go1exp import robot
 from go1exp.config.choices import choice_files, config_folder, load
 from go1exp.config.schema.joint_values import JointValues, numbers
 from go1exp.config.schema.physics import BackendConfig, ContactConfig, fitting_step
 from go1exp.config.schema.registry import ConfigError, Term
+from go1exp.config.schema.settings import subset
 from go1exp.evaluate.protocol.ground import UNITS, GroundName, Lanes
 from go1exp.evaluate.protocol.stage import delay_of_effects
 from go1exp.evaluate.rollout import EvalConfig, delayed, evaluation_task
@@ -173,13 +174,12 @@ def _scaled(value: JointValues, param: Param, size: float) -> Any:
 
 def lines(effects: Mapping[str, Term]) -> dict[str, str]:
     """Return a description of each effect: its title, and its parameters at size 1."""
-    return {name: _about(term) for name, term in effects.items()}
-
-
-def _about(term: Any) -> str:
-    units = {p.name: "" if p.unit == "-" else f" {p.unit}" for p in params_of(term)}
-    values = ", ".join(f"{name} {value}{units.get(name, '')}" for name, value in term.parameters.items())
-    return f"{term.entry.target.title}; at size 1: {values}"
+    about = {}
+    for key, term in effects.items():
+        units = {p.name: "" if p.unit == "-" else f" {p.unit}" for p in params_of(term)}
+        values = ", ".join(f"{name} {value}{units.get(name, '')}" for name, value in term.parameters.items())
+        about[key] = f"{cast(Any, term.entry.target).title}; at size 1: {values}"
+    return about
 
 
 HARDEST: dict[GroundName, float] = {
@@ -241,19 +241,8 @@ def task_under(task: TaskConfig, setup: Setup, known: Mapping[str, Ground], effe
     """Return a policy's task under ``setup``, the physics step rounded down to fit; raise ConfigError of misfits."""
     if setup.ground not in known:
         raise ConfigError([f"ground = {setup.ground!r}: known are {', '.join(known)}"])
-    period = task.sim.policy_dt
-    step = setup.physics_dt or task.sim.physics_dt
-    config = EvalConfig(
-        commands=(),
-        episodes=1,
-        seconds=FOREVER,
-        noise=setup.noise,
-        randomize=setup.randomize,
-        push=setup.push,
-        seed=setup.seed,
-        physics_dt=fitting_step(period, step),
-        engine=setup.engine,
-    )
+    step = fitting_step(task.sim.policy_dt, setup.physics_dt or task.sim.physics_dt)
+    config = subset(EvalConfig, setup, commands=(), episodes=1, seconds=FOREVER, physics_dt=step)
     ground, effect = known[setup.ground].built(setup.level), active(setup.sizes, effects, task.actuator, task.contact)
     made = dataclasses.replace(evaluation_task(task, config), terrain=ground, effect=effect)
     return delayed(made, setup.delay + delay_of_effects(made)) if setup.delay > 0.0 else made

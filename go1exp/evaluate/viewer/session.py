@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import accumulate, pairwise
 
 import numpy as np
 import torch
@@ -35,13 +35,11 @@ class History:
 
     def __init__(self, widths: Mapping[str, int], dt: float) -> None:
         """Keep the last ``SPAN`` s."""
-        self.widths, self.dt = dict(widths), dt
+        self.dt, self.count = dt, 0
         self._rows = max(2, round(SPAN / dt))
-        ends = np.cumsum([0, *self.widths.values()])
-        spans = pairwise(ends)
-        self._place = {name: slice(int(a), int(b)) for name, (a, b) in zip(self.widths, spans, strict=True)}
-        self._values = np.full((self._rows, int(ends[-1])), np.nan)
-        self.count = 0
+        ends = [0, *accumulate(widths.values())]
+        self._place = {name: slice(a, b) for name, (a, b) in zip(widths, pairwise(ends), strict=True)}
+        self._values = np.full((self._rows, ends[-1]), np.nan)
 
     def add(self, quantities: Mapping[str, NDArray[np.floating]]) -> None:
         """Add a row; missing quantities are not drawn there."""
@@ -50,10 +48,6 @@ class History:
         for name, values in quantities.items():
             row[self._place[name]] = values
         self.count += 1
-
-    def clear(self) -> None:
-        """Remove all rows."""
-        self.count = 0
 
     @property
     def filled(self) -> int:

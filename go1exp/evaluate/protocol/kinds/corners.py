@@ -99,8 +99,7 @@ def _answers(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> plots.Figu
     ax.set_yticks(range(len(first)), [command_text(e["condition"]) for e in first], fontsize=7)
     ax.invert_yaxis()
     ax.set_xlabel("share of the command")
-    if len(summaries) > 1:
-        plots.legend(figure, ax)
+    plots.legend(figure, ax)
     return figure
 
 

@@ -19,7 +19,7 @@ from go1exp.evaluate.protocol.kinds.gait import straight
 from go1exp.evaluate.protocol.kinds.steady import ERRORS, Steady
 from go1exp.evaluate.protocol.plan import Motion
 from go1exp.evaluate.quantities import Column, Row, add_measures
-from go1exp.mdp.measures.trace import Trace, mean_over
+from go1exp.mdp.measures.trace import Trace, mean_over, percentile_over
 
 SATURATED = 0.99  # share of the peak torque from which on an actuator counts as saturated
 POINTS = 1500  # most dots of one kind of joint in the scatter
@@ -92,17 +92,14 @@ def effort(trace: Trace) -> dict[str, NDArray[np.float64]]:
     with np.errstate(divide="ignore", invalid="ignore"):
         per_way = 1.0 / np.where(way >= 0.1, weight * way, np.nan)
     share = np.abs(torque) / robot.per_joint(robot.EFFORT_LIMIT)
-    counted = np.where(trace.counts, power, np.nan)
-    sample = trace.counts.any(0)
-    high = {name: np.full(trace.robots, np.nan) for name in ("power_p99", "power_max")}
-    high["power_p99"][sample] = np.nanpercentile(counted[:, sample], 99.0, axis=0)
-    high["power_max"][sample] = np.nanmax(counted[:, sample], axis=0)
+    power_p99, power_max = (percentile_over(power, trace.counts, percent) for percent in (99.0, 100.0))
     return {
         "cost_of_transport_abs": mean_over(power, trace.moving) * per_way,
         "heat_per_way": mean_over((torque**2).sum(-1), trace.moving) * per_way,
-        **high,
+        "power_p99": power_p99,
+        "power_max": power_max,
         "saturated": mean_over((share >= SATURATED).mean(-1), trace.counts),
-        "protect_level": np.ceil(high["power_max"] / PROTECTED_AT),
+        "protect_level": np.ceil(power_max / PROTECTED_AT),
     }
 
 

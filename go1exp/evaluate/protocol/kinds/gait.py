@@ -147,8 +147,7 @@ def _over_speed(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> plots.F
         ax.set_ylabel(text)
     for ax in axes[-1]:
         ax.set_xlabel("commanded vx (m/s)")
-    if len(summaries) > 1:
-        plots.legend(figure, axes[0, 0])
+    plots.legend(figure, axes[0, 0])
     return figure
 
 

@@ -12,9 +12,9 @@ from pydantic import Field
 
 from go1exp.base.report import plots
 from go1exp.base.report.plots import Drawing
-from go1exp.config.schema.registry import Positive, protocol
+from go1exp.config.schema.registry import Count, Positive, protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Cause, Count, Length, Played, Protocol, lives
+from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, lives
 from go1exp.evaluate.protocol.plan import Impulse, Impulses, Motion, Plan, Point, Signal
 from go1exp.evaluate.quantities import Column, Derived, Row, by_condition, values
 

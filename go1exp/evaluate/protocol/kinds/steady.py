@@ -13,6 +13,7 @@ from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, lives, repeated
 from go1exp.evaluate.protocol.plan import Constant, Motion, Plan, Velocity
 from go1exp.evaluate.quantities import AXES, Column, Row, add_measures
+from go1exp.mdp.measures.trace import mean_over
 
 if TYPE_CHECKING:
     from go1exp.evaluate.protocol.stage import Stage
@@ -65,7 +66,7 @@ class Steady(Protocol):
         settle = round(self.settle_s / stage.policy_dt)
         motion = stage.run(Plan(command, listen_from=settle if self.terms() else None))
         rows = lives(motion)
-        error = _error(motion, settle)
+        error = np.sqrt(mean_over((motion.velocity - motion.command)[settle:] ** 2, motion.alive[settle:]))
         for n, row in enumerate(rows):
             row |= {**by_axis(self.commands[n // self.robots]), "robot": n % self.robots}
         add_measures(rows, {f"rmse_{axis}": error[:, k] for k, axis in enumerate(AXES)})
@@ -79,14 +80,6 @@ class Steady(Protocol):
     def curves(self, motion: Motion, rows: Sequence[Row], settle: int) -> dict[str, Any]:
         """Return plain data for drawings."""
         return {}
-
-
-def _error(motion: Motion, settle: int) -> np.ndarray:
-    """(N, 3) root mean square errors while up, NaN for robots that were not at all."""
-    up = motion.alive[settle:, :, None]
-    square = np.where(up, (motion.velocity - motion.command)[settle:] ** 2, 0.0).sum(0)
-    count = up.sum(0)
-    return np.sqrt(np.divide(square, count, out=np.full(square.shape, np.nan), where=count > 0))
 
 
 def by_axis(command: Sequence[float]) -> dict[str, float]:

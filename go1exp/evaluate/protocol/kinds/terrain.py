@@ -14,7 +14,7 @@ from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import NonNegative, PositiveRange, Speed, protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, lives, repeated
-from go1exp.evaluate.protocol.ground import UNITS, GroundName, Lanes, goal
+from go1exp.evaluate.protocol.ground import GOAL, UNITS, GroundName, Lanes
 from go1exp.evaluate.protocol.plan import Motion, Plan
 from go1exp.evaluate.quantities import Column, Derived, Row, values
 from go1exp.evaluate.statistics.intervals import Logistic, logistic_fit
@@ -78,7 +78,7 @@ class OnTerrain(Protocol):
 
     def duration(self, speed: float) -> float:
         """Return the time that a robot has, s."""
-        return self.slack * (goal() + 0.5) / speed + START_S
+        return self.slack * (GOAL + 0.5) / speed + START_S
 
     def lengths(self) -> list[Length]:
         """Return that of each ground at each speed, all difficulties as one batch."""
@@ -90,7 +90,7 @@ class OnTerrain(Protocol):
         ]
 
     def _causes(self, speed: float) -> list[Cause]:
-        way, slack = goal() + 0.5, self.slack
+        way, slack = GOAL + 0.5, self.slack
 
         def pace(seconds: float) -> float:
             return slack * way / (seconds - START_S) if seconds > START_S else -1.0  # at no speed
@@ -110,9 +110,7 @@ class OnTerrain(Protocol):
                 t = stage.times(self.duration(speed))
                 command = np.tile(np.array([speed, 0.0, 0.0]), (len(t), len(levels) * self.robots, 1))
                 listen = 0 if self.terms() else None
-                plan = Plan(
-                    command, ground=lanes, friction=friction, steer=self.steer, listen_from=listen, finish=goal()
-                )
+                plan = Plan(command, ground=lanes, friction=friction, steer=self.steer, listen_from=listen, finish=GOAL)
                 motion = stage.run(plan)
                 those = self._rows(motion, name, speed, levels)
                 self.measure(motion, those)
@@ -121,7 +119,7 @@ class OnTerrain(Protocol):
 
     def _rows(self, motion: Motion, name: str, speed: float, levels: Sequence[float]) -> list[Row]:
         """Return a row for each robot: robot i walks lane i modulo the number of lanes."""
-        arrived = (motion.way >= goal()) & motion.alive
+        arrived = (motion.way >= GOAL) & motion.alive
         passed, first = np.asarray(arrived.any(0)), np.asarray(arrived.argmax(0))
         rows = lives(motion)
         for n, row in enumerate(rows):
