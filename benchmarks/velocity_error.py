@@ -16,7 +16,7 @@ import numpy as np
 
 from go1exp.base.tensors.threads import one_thread
 from go1exp.config.schema.physics import CpuBackend
-from go1exp.evaluate.agents import EstimatedVelocity
+from go1exp.evaluate.agents import VelocityFilters
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import parse_train
 from go1exp.train import run_folder
@@ -32,7 +32,7 @@ def errors(run: Path, robots: int, seconds: float, seed: int) -> tuple[np.ndarra
     sim = dataclasses.replace(config.task.sim, physics_dt=0.002, episode_s=seconds + 1.0, spread_starts=False)
     task = dataclasses.replace(config.task, sim=sim, backend=CpuBackend("cpu", threads=1))
     core = Go1Core(task, robots, seed, imu=True)
-    estimated, observation = EstimatedVelocity(core, True, seed), core.reset()
+    estimated, observation = VelocityFilters(core, True, seed), core.reset()
     rows, upright = [], np.ones(robots, dtype=bool)
     for _ in range(round(seconds / sim.policy_dt)):
         result = core.step(policy(estimated.put(observation)))

@@ -25,7 +25,7 @@ from go1exp.evaluate.viewer.walk import WalkShow
 from go1exp.gap import files
 from go1exp.logs.recording import write
 from tests.small_run import trained
-from tests.test_viewer import answer, recording
+from tests.test_viewer import answer, qpos, recording
 
 ELSEWHERE = "127.0.0.2"
 """Another address of this machine alone."""
@@ -99,12 +99,12 @@ def test_a_bundle_walks_on_the_page_and_hands_over(
     session = show.session
     assert session.label == "mine"
     assert session.command == (0.3, 0.0, 0.0)
-    before = session.qpos().copy()
+    before = qpos(session)
     for _ in range(5):
         show.tick()
     assert session.time == pytest.approx(5 * session.dt)
-    assert np.isfinite(session.qpos()).all()
-    assert not np.array_equal(session.qpos(), before)
+    assert np.isfinite(qpos(session)).all()
+    assert not np.array_equal(qpos(session), before)
     for label in ("clock", "mine"):  # to a policy of the package and back, while it walks
         show.ask(ask.SelectPolicy(label))
         assert (session.label, session.message) == (label, "")

@@ -54,7 +54,8 @@ class Telling(WalkShow):
 
     def _told(self) -> dict[str, Any]:
         s = self.session
-        told = {"time": s.time, "command": s.command, "x": s.qpos()[0], "velocity": s.velocity(1.0).tolist()}
+        told: dict[str, Any] = {"time": s.time, "command": s.command, "x": float(s.core.backend.qpos[0, 0])}
+        told["velocity"] = s.history.last("true", 1.0).mean(0).tolist()
         sideways = s.history.last("true", min(s.time - s.push.time, 5.0))[:, 1] if s.push.impulse else [0.0]
         told |= {"pushed": s.push.time if s.push.impulse else None, "sideways": max(sideways)}
         told |= {"marked": float(s.history.series("push").max()), "robot_cpu_s": time.process_time()}

@@ -77,7 +77,8 @@ def lines(made: Report) -> list[str]:
     """Return the lines for a terminal: groups, excluded runs, remarks, verdicts."""
     from go1exp.base.report.table import interval_text, number
     from go1exp.base.wording import counted
-    from go1exp.evaluate.report.tables import about_baseline, counts
+    from go1exp.evaluate.report.tables import about_baseline
+    from go1exp.evaluate.statistics.runs import ORDER
 
     runs = sum(len(g.runs) for g in made.groups)
     text_lines = [f"{counted(runs, 'run')} in {counted(len(made.groups), 'group')}; {about_baseline(made)}"]
@@ -87,7 +88,7 @@ def lines(made: Report) -> list[str]:
     for outcome in made.outcomes:
         clear = [v for v in outcome.verdicts if v.word != "no significant difference"]
         if outcome.verdicts:
-            words = ", ".join(f"{n} {word}" for word, n in counts(outcome.verdicts).items())
+            words = ", ".join(f"{sum(v.word == word for v in outcome.verdicts)} {word}" for word in ORDER)
             text_lines.append(f"{outcome.evaluation.name}: {words}")
         for v in clear:
             d = v.difference.estimate

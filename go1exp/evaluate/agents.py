@@ -90,7 +90,7 @@ class VelocityFilters:
         ``noise`` adds the sensor noise of the paper's Table II, and a logger's to accelerometer and feet, drawn by
         ``seed``.
         """
-        self._filters = Filters(core.num_envs)
+        self._filters, self._columns = Filters(core.num_envs), columns(core.task, TERM)
         self._plant, self._dt, self._steps = core.plant, core.task.sim.physics_dt, 0
         self._noise, self._rng = float(noise), np.random.default_rng([seed, 2])
         self._observer, core.plant.observer = core.plant.observer, self._update
@@ -98,6 +98,12 @@ class VelocityFilters:
     def velocities(self) -> NDArray[np.float64]:
         """Return the estimated velocities of the trunks in their own frames (N, 3), m/s; zero until a filter runs."""
         return self._filters.velocities
+
+    def put(self, observation: Tensor) -> Tensor:
+        """Return the observation (N, O) with the estimated velocity in place of the true one."""
+        changed = observation.clone()
+        changed[:, self._columns] = torch.as_tensor(self.velocities(), dtype=observation.dtype)
+        return changed
 
     def restart(self, env: int) -> None:
         """Initialise one robot's filter with its next sample."""
@@ -111,21 +117,13 @@ class VelocityFilters:
         self._steps += 1
 
 
-class EstimatedVelocity(VelocityFilters):
-    """The filters of a policy that observes the trunk's velocity; raises ConfigError for one that does not."""
-
-    def __init__(self, core: Go1Core, noise: bool, seed: int) -> None:
-        velocity_columns = columns(core.task, TERM)
-        if velocity_columns is None:
-            raise ConfigError([f"trunk_velocity = 'estimated': the policy does not see {TERM}"])
-        self._columns = velocity_columns
-        super().__init__(core, noise, seed)
-
-    def put(self, observation: Tensor) -> Tensor:
-        """Return the observation (N, O) with the estimated velocity in place of the true one."""
-        changed = observation.clone()
-        changed[:, self._columns] = torch.as_tensor(self.velocities(), dtype=observation.dtype)
-        return changed
+def estimator(core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> VelocityFilters | None:
+    """Return the filters of a policy that observes the estimated velocity, else None; raise ConfigError without one."""
+    if trunk_velocity == "exact":
+        return None
+    if columns(core.task, TERM) is None:
+        raise ConfigError([f"trunk_velocity = 'estimated': the policy does not see {TERM}"])
+    return VelocityFilters(core, core.noise, seed)
 
 
 @dataclass(frozen=True)
@@ -146,7 +144,7 @@ class PolicyAgent(Agent):
 class _RunningPolicy:
     def __init__(self, agent: PolicyAgent, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> None:
         self._policy, self._core = agent.policy, core
-        self._filter = EstimatedVelocity(core, core.noise, seed) if trunk_velocity == "estimated" else None
+        self._filter = estimator(core, trunk_velocity, seed)
         # A policy that runs faster than it was trained: its mean action and its frames of a training period (``Past``).
         periods = agent.task.sim.policy_dt, core.task.sim.policy_dt
         self._actions, self._frames = Past[Tensor](*periods), Past[Tensor](*periods)
@@ -199,7 +197,7 @@ NOISY = {"joint_pos": "q", "joint_vel": "qd", "imu_quat": "quat", "imu_gyro": "g
 class _RunningBundle:
     def __init__(self, agent: BundleAgent, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> None:
         self._bundle, self._core = agent.bundle, core
-        self._filter = EstimatedVelocity(core, core.noise, seed) if trunk_velocity == "estimated" else None
+        self._filter = estimator(core, trunk_velocity, seed)
         self._memory = PolicyMemory(agent.bundle.metadata, core.task.sim.policy_dt, core.num_envs)
         self._rng = np.random.default_rng([seed, 3])
 

@@ -131,7 +131,7 @@ BETTER: dict[str, Literal["lower", "higher"]] = {
 """Measures of which less or more is better; neither of the others."""
 
 
-def columns_of(terms: Sequence[Term], legs: Sequence[str]) -> list[Column]:
+def columns_of(terms: Sequence[Term]) -> list[Column]:
     """Return the columns of measures, one for each foot where they have a value per foot; names have none."""
     entries_so_far = []
     for term in terms:
@@ -140,19 +140,20 @@ def columns_of(terms: Sequence[Term], legs: Sequence[str]) -> list[Column]:
             continue
         unit = "" if unit == "-" else unit
         how: Literal["mean", "phase"] = "phase" if term.entry.traits.get("circular") else "mean"
-        names = [f"{term.key}_{leg}" for leg in legs] if per_foot(term.entry) else [term.key]
+        names = [f"{term.key}_{leg}" for leg in robot.LEGS] if per_foot(term.entry) else [term.key]
         entries_so_far += [Column(name, unit, doc, how, BETTER.get(term.entry.name)) for name in names]
     return entries_so_far
 
 
-def add_measures(rows: Sequence[Row], measures: Mapping[str, Any], legs: Sequence[str] = ()) -> None:
+def add_measures(rows: Sequence[Row], measures: Mapping[str, Any]) -> None:
     """Write the measures, (N,) or (N, 4) each by name, None if not measured, into the rows of the N robots."""
     for name, each in measures.items():
         if each is None or each.dtype.kind == "U":
             continue
         for row, value in zip(rows, each, strict=True):
             of_legs = np.ndim(value) > 0
-            parts = {f"{name}_{leg}": v for leg, v in zip(legs, value, strict=True)} if of_legs else {name: value}
+            names = [f"{name}_{leg}" for leg in robot.LEGS] if of_legs else [name]
+            parts = dict(zip(names, np.atleast_1d(value), strict=True))
             row |= {k: float(v) if np.isfinite(v) else None for k, v in parts.items()}
 
 
@@ -234,7 +235,7 @@ def rows_of(
         }
         for i in range(len(fell))
     ]
-    add_measures(rows, measures, robot.LEGS)
+    add_measures(rows, measures)
     return rows
 
 

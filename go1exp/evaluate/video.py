@@ -284,11 +284,14 @@ def _window(stage: Stage, on_key: Callable[[int], None]) -> Iterator[Any]:
             thread.join(5.0)
 
 
-def poses_of(core: Go1Core, policy: Policy, seconds: float, count: int = 8) -> list[np.ndarray]:
-    """Return ``count`` poses of robot 0: world x, z (4, 4, 2), m, of each leg's hip, thigh joint, knee and foot."""
+POSES = 8  # of a picture
+
+
+def poses_of(core: Go1Core, policy: Policy, seconds: float) -> list[np.ndarray]:
+    """Return poses of robot 0: world x, z (4, 4, 2), m, of each leg's hip, thigh joint, knee and foot."""
     data = mujoco.MjData(core.backend.model)
     steps = round(seconds / core.task.sim.policy_dt)
-    wanted = set(np.linspace(steps // 2, steps - 1, count).astype(int).tolist())
+    wanted = set(np.linspace(steps // 2, steps - 1, POSES).astype(int).tolist())
     poses = []
     observation = core.reset()
     for step in range(steps):
@@ -304,11 +307,13 @@ def poses_of(core: Go1Core, policy: Policy, seconds: float, count: int = 8) -> l
     return poses
 
 
-def write_png(path: Path, poses: list[np.ndarray]) -> None:
-    """Draw poses side by side, right legs dark and left legs light."""
+def picture(core: Go1Core, policy: Policy, seconds: float, path: Path) -> None:
+    """Run a policy and draw its poses side by side, right legs dark and left legs light."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    with torch.no_grad():
+        poses = poses_of(core, policy, seconds)
     figure = Figure(figsize=(2.0 * len(poses), 2.2), layout="constrained")
     FigureCanvasAgg(figure)
     for axes, pose in zip(np.atleast_1d(figure.subplots(1, len(poses), sharey=True)), poses, strict=True):
@@ -322,9 +327,3 @@ def write_png(path: Path, poses: list[np.ndarray]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path, keep_suffix=True) as partial:
         figure.savefig(partial, dpi=100)
-
-
-def picture(core: Go1Core, policy: Policy, seconds: float, path: Path) -> None:
-    """Run a policy and draw its poses."""
-    with torch.no_grad():
-        write_png(path, poses_of(core, policy, seconds))

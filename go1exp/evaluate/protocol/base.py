@@ -4,20 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
-from go1exp import robot
 from go1exp.base.report.plots import Drawing
-from go1exp.config.schema.registry import ConfigError, Count, Term, bind_list, find, members, unknown_name
+from go1exp.config.schema.registry import (
+    ConfigError,
+    Count,
+    NonNegative,
+    Positive,
+    Term,
+    bind_list,
+    find,
+    members,
+    unknown_name,
+)
 from go1exp.config.schema.settings import parse, settings
 from go1exp.evaluate.controller.types import TrunkVelocity
 from go1exp.evaluate.protocol.claims import Claim
-from go1exp.evaluate.protocol.plan import Motion
-from go1exp.evaluate.quantities import FINGERPRINT, LIFE, Column, Derived, Row, add_measures, columns_of, finite
+from go1exp.evaluate.protocol.plan import Constant, Motion, Plan, Velocity
+from go1exp.evaluate.quantities import AXES, FINGERPRINT, LIFE, Column, Derived, Row, add_measures, columns_of, finite
 from go1exp.mdp.measures import measured
+from go1exp.mdp.measures.trace import mean_over
 
 if TYPE_CHECKING:
     from go1exp.evaluate.protocol.stage import Stage
@@ -99,7 +110,7 @@ class Protocol:
 
     def columns(self) -> tuple[Column, ...]:
         """Return every figure of a robot."""
-        return (*LIFE, *self.robot_columns, *columns_of(self.terms(), robot.LEGS))
+        return (*LIFE, *self.robot_columns, *columns_of(self.terms()))
 
     def policy_velocities(self) -> dict[str, TrunkVelocity]:
         """Return the trunk velocity that policies observe, by the key that chooses it."""
@@ -136,7 +147,7 @@ class Protocol:
     def measure(self, motion: Motion, rows: Sequence[Row]) -> None:
         """Write the measures of a recorded motion into the rows of its robots."""
         if motion.trace is not None and self.terms():
-            add_measures(rows, measured(motion.trace, self.terms()), robot.LEGS)
+            add_measures(rows, measured(motion.trace, self.terms()))
 
 
 def repeated(name: str, values: Sequence[Any]) -> list[str]:
@@ -167,6 +178,80 @@ def lives(motion: Motion) -> list[Row]:
         {"fell": bool(fell), "left_map": bool(left), "moving_s": round(float(s), 4), FINGERPRINT: float(mark)}
         for fell, left, s, mark in lives_of_robots
     ]
+
+
+ERRORS = tuple(
+    Column(f"rmse_{axis}", unit, f"root mean square error of {axis}, gait included", better="lower")
+    for axis, unit in zip(AXES, ("m/s", "m/s", "rad/s"), strict=True)
+)
+
+
+@settings
+class Steady(Protocol):
+    """Base of protocols of constant commands, the robots of each command side by side.
+
+    Attributes:
+        commands: each as x m/s, y m/s, yaw rad/s.
+        seconds: length, s.
+        settle_s: time at its start that counts for falls alone, s.
+        rest_s: time at its start, within ``settle_s``, with a zero command, s.
+    """
+
+    commands: Annotated[tuple[Velocity, ...], Field(min_length=1)]
+    seconds: Positive
+    settle_s: NonNegative
+    rest_s: NonNegative
+
+    keys: ClassVar[tuple[str, ...]] = AXES
+
+    def __post_init__(self) -> None:
+        if not self.rest_s <= self.settle_s < self.seconds:
+            order = f"rest_s = {self.rest_s} and seconds = {self.seconds}"
+            raise ValueError(f"settle_s = {self.settle_s}: must lie between {order}")
+        if wrong := repeated("commands", self.commands):
+            raise ValueError(wrong[0])
+
+    def lengths(self) -> list[Length]:
+        """Return that of all commands as one batch."""
+        robots, recorded = self.robots * len(self.commands), bool(self.terms())
+        return [Length(self.seconds, robots, self.causes(), self.settle_s, recorded)]
+
+    def causes(self) -> list[Cause]:
+        """Return what says how long a batch plays."""
+        return [Cause("seconds", self.seconds, least=self.settle_s)]
+
+    def play(self, stage: Stage) -> Played:
+        """Play all commands as one batch."""
+        t = stage.times(self.seconds)
+        signals = [Constant(velocity=c, rest=self.rest_s).at(t) for c in self.commands]
+        command = np.repeat(np.stack(signals, 1), self.robots, axis=1)
+        settle = round(self.settle_s / stage.policy_dt)
+        motion = stage.run(Plan(command, listen_from=settle if self.terms() else None))
+        rows = lives(motion)
+        error = np.sqrt(mean_over((motion.velocity - motion.command)[settle:] ** 2, motion.alive[settle:]))
+        for n, row in enumerate(rows):
+            row |= {**by_axis(self.commands[n // self.robots]), "robot": n % self.robots}
+        add_measures(rows, {f"rmse_{axis}": error[:, k] for k, axis in enumerate(AXES)})
+        self.measure(motion, rows)
+        self.also(motion, rows, settle)
+        return Played(rows, self.curves(motion, rows, settle))
+
+    def also(self, motion: Motion, rows: Sequence[Row], settle: int) -> None:
+        """Write further figures into the rows; ``settle`` is the step from which they count."""
+
+    def curves(self, motion: Motion, rows: Sequence[Row], settle: int) -> dict[str, Any]:
+        """Return plain data for drawings."""
+        return {}
+
+
+def by_axis(command: Sequence[float]) -> dict[str, float]:
+    """Return a command (3,) by the names of its axes."""
+    return dict(zip(AXES, map(float, command), strict=True))
+
+
+def command_text(condition: Mapping[str, Any]) -> str:
+    """Write a command of one or more axes, such as x 0.5, yaw 1."""
+    return ", ".join(f"{axis} {condition[axis]:g}" for axis in AXES if condition[axis]) or "stand"
 
 
 GRID = "grid"  # the protocol that is the grid of ``go1exp eval`` itself and has no keys here

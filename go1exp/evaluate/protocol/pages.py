@@ -22,7 +22,7 @@ from go1exp.evaluate.quantities import ROBOT, finite, write_rows
 from go1exp.evaluate.statistics.runs import ORDER as COMPARED
 
 Entry = Mapping[str, Any]
-Meanings = Mapping[str, tuple[str, str]]
+Meanings = Mapping[str, str]
 
 ACROSS = 5  # most columns of quantities in a table, so that it fits on paper
 MANY = 8  # largest number of conditions that are columns; more are rows
@@ -79,17 +79,12 @@ def falls(result: Result) -> str:
     return text + (f"; {counted(down, 'robot')} fell before anything counted." if down else ".")
 
 
-def meanings(result: Result) -> dict[str, tuple[str, str]]:
-    """Return the unit and the meaning of each quantity by its name."""
+def meanings(result: Result) -> dict[str, str]:
+    """Return the meaning of each quantity by its name, without the shape of values and without markup."""
     protocol = result.chosen.protocol
-    columns = {c.name: (c.unit, _plain(c.meaning)) for c in protocol.columns()}
-    derived = {d.name: (d.unit, d.meaning) for d in protocol.derived(result.played.rows)}
-    return {**columns, "falls_per_minute": ("1/min", "falls per moving robot-minute"), **derived}
-
-
-def _plain(docstring: str) -> str:
-    """Return a docstring without the shape of values and without markup."""
-    return re.sub(r" \((?:N|S|4|,| )+\)", "", docstring).replace("`", "")
+    columns = {c.name: re.sub(r" \((?:N|S|4|,| )+\)", "", c.meaning).replace("`", "") for c in protocol.columns()}
+    derived = {d.name: d.meaning for d in protocol.derived(result.played.rows)}
+    return {**columns, "falls_per_minute": "falls per moving robot-minute", **derived}
 
 
 def claims_table(result: Result, means: Meanings) -> Table:
@@ -100,7 +95,7 @@ def claims_table(result: Result, means: Meanings) -> Table:
         unit = _unit(v.claim.quantity, [e for e in result.summary if e["condition"] == v.condition])
         limit = f"{limits(v.claim)} {unit}".rstrip()
         value = spread(v.figure.estimate, v.figure.low, v.figure.high, f"n {v.figure.n}")
-        quantity = Cell(v.claim.quantity, means.get(v.claim.quantity, ("", ""))[1], "name")
+        quantity = Cell(v.claim.quantity, means.get(v.claim.quantity, ""), "name")
         rows.append([v.name.replace("_", " "), verdict(v.word), value, limit, quantity, where, v.claim.source])
     header = ["claim", "verdict", "value [95 %] n", "limit", "quantity", "where", "source of the limit"]
     return Table("Claims", header, rows, VERDICTS if rows else "None.")
@@ -125,7 +120,7 @@ def figure_tables(entries: Sequence[Entry], means: Meanings) -> list[Table]:
             tables += _split(title, "quantity", _explained(units, means), where, cells)
         else:
             across: list[list[Any]] = [list(column) for column in zip(*cells, strict=True)]
-            notes = [f"{name}: {means[name][1]}" if name in means else "" for name in units]
+            notes = [f"{name}: {means[name]}" if name in means else "" for name in units]
             tables += _split(title, "condition", where, [named(*head) for head in units.items()], across, notes)
     return tables
 
@@ -173,7 +168,7 @@ def _explained(units: Mapping[str, str], means: Meanings) -> list[Cell]:
     """Return the heads of rows, each with its meaning unless the row above has the same."""
     heads, above = [], ""
     for name, unit in units.items():
-        meaning = means.get(name, ("", ""))[1]
+        meaning = means.get(name, "")
         heads.append(Cell(named(name, unit), "" if meaning == above else meaning, "name"))
         above = meaning
     return heads
@@ -298,7 +293,7 @@ def _differences(key: str, differences: Sequence[Difference], first: str, means:
     for d in sorted(differences, key=lambda d: (COMPARED.index(d.verdict), quantities.index(d.figure))):
         if d.figure in zero:
             continue
-        meaning = "" if d.figure == above else means.get(d.figure, ("", ""))[1]
+        meaning = "" if d.figure == above else means.get(d.figure, "")
         head, above = Cell(named(d.figure, d.unit), meaning, "name"), d.figure
         between = spread(d.difference.estimate, d.difference.low, d.difference.high, f"n {d.difference.n}")
         who = [d.subject] if len(subjects) > 1 else []

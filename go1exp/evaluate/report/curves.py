@@ -36,10 +36,10 @@ class Curve:
 
 @dataclass(frozen=True)
 class Metrics:
-    """Logged metrics of a run: (rows,) of each requested column; ``hours`` is training time; names of all columns."""
+    """Logged metrics of a run."""
 
-    columns: dict[str, Floats]
-    available: tuple[str, ...] = ()
+    columns: dict[str, Floats]  # (rows,) of each requested column; ``hours`` is training time
+    available: tuple[str, ...] = ()  # names of all columns
 
 
 def read(run: Path, wanted: Sequence[str]) -> tuple[Metrics, str]:

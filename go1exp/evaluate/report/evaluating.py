@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from go1exp.config.schema.registry import TooLongError, bind_list
 from go1exp.config.schema.settings import subset
-from go1exp.evaluate.agents import PolicyAgent
+from go1exp.evaluate.agents import PolicyAgent, Progress
 from go1exp.evaluate.protocol.base import Chosen
 from go1exp.evaluate.protocol.pages import write as write_protocol
 from go1exp.evaluate.protocol.playing import Rates, play
@@ -23,26 +22,13 @@ from go1exp.train.policy import load_run
 BEST = "best.pt"  # the checkpoint that evaluation during training found best, in a run folder
 
 
-Progress = Callable[[int, int], None]
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """One evaluation of one run: by a protocol, or on the grid for None."""
-
-    run: Run
-    protocol: Chosen | None
-
-    @property
-    def label(self) -> str:
-        """Name in messages."""
-        return f"{self.run.label}, {self.protocol.key if self.protocol else GRID}"
+Wanted = tuple[Run, Chosen | None]  # an evaluation of a run: by a protocol, or on the grid for None
 
 
 def missing(runs: Sequence[Run], protocols: Sequence[Chosen | None] = (None,)) -> list[Wanted]:
     """Return the evaluations (None: the grid) that runs with a checkpoint do not have."""
     return [
-        Wanted(run, protocol)
+        (run, protocol)
         for run in runs
         for protocol in protocols
         if (protocol.key if protocol else GRID) not in names(run) and any((run.folder / "checkpoints").glob("*.pt"))
@@ -83,16 +69,17 @@ def evaluate_missing(
     ``on_run`` gets the number of an evaluation, that of all, and its label, and returns a progress callback.
     """
     notes = []
-    for number, each in enumerate(wanted, 1):
-        show = on_run(number, len(wanted), each.label)
+    for number, (run, protocol) in enumerate(wanted, 1):
+        label = f"{run.label}, {protocol.key if protocol else GRID}"
+        show = on_run(number, len(wanted), label)
         try:
-            if each.protocol is None:
-                write(evaluate_run(each.run.folder, settings, show), each.run.folder / FILE)
+            if protocol is None:
+                write(evaluate_run(run.folder, settings, show), run.folder / FILE)
             else:
-                play_protocol(each.run, each.protocol, settings, show)
+                play_protocol(run, protocol, settings, show)
         except TooLongError as error:  # asked of every run: none could be evaluated
-            group = "" if each.protocol else "evaluation."
+            group = "" if protocol else "evaluation."
             raise TooLongError([group + problem for problem in error.problems]) from None
         except (OSError, RuntimeError, ValueError) as error:
-            notes.append(f"{each.label}: could not be evaluated ({' '.join(str(error).split())[:160]})")
+            notes.append(f"{label}: could not be evaluated ({' '.join(str(error).split())[:160]})")
     return notes

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from go1exp import robot
 from go1exp.config.schema.registry import ConfigError, unknown_name
 from go1exp.evaluate.protocol.base import Chosen, Protocol, chosen
 from go1exp.evaluate.quantities import AXES, COLUMNS, FELL, FILE, MOVING, ROBOT, Column, columns_of, rows_file
@@ -87,7 +86,7 @@ def check_figures(wanted: Sequence[str], known: Sequence[Evaluation], to_come: S
 
 
 def _grid_columns() -> tuple[Column, ...]:
-    return (*COLUMNS, *columns_of(every_measure(), robot.LEGS))
+    return (*COLUMNS, *columns_of(every_measure()))
 
 
 def _listed(labels: Sequence[str]) -> str:
@@ -159,12 +158,10 @@ def _table(file: Path) -> dict[str, NDArray[Any]]:
     columns = {}
     for name in table.column_names:
         values = table[name].to_pylist()
-        textual = any(isinstance(v, str | list) for v in values)
-        columns[name] = (
-            np.array([json.dumps(v) if isinstance(v, list) else str(v) for v in values])
-            if textual
-            else np.array([np.nan if v is None else float(v) for v in values])
-        )
+        if any(isinstance(v, str | list) for v in values):
+            columns[name] = np.array([json.dumps(v) if isinstance(v, list) else str(v) for v in values])
+        else:
+            columns[name] = np.array([np.nan if v is None else float(v) for v in values])
     return columns
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 from go1exp.base.report.table import NOTHING, Cell, Table, interval_text, number, spread, verdict
@@ -221,8 +220,3 @@ def _sensitivity_rows(outcome: Outcome) -> list[PlainRow]:
         | {"importance": e.association.importance, "n": e.association.n}
         for e in outcome.sensitivities
     ]
-
-
-def counts(verdicts: Sequence[Verdict]) -> dict[str, int]:
-    """Return the number of verdicts with each word."""
-    return {word: sum(v.word == word for v in verdicts) for word in ORDER}

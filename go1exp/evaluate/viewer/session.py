@@ -281,18 +281,10 @@ class Session:
             row["estimated"] = np.array([*self._estimate.velocities()[0, :2], float(gyro[0, 2])])
         self.history.add(row)
 
-    def qpos(self) -> Vector:
-        """Return position, attitude and joint angles (19,)."""
-        return np.asarray(self.core.backend.qpos[0].cpu().double().numpy())
-
     def trained_for(self) -> dict[str, tuple[float, float]]:
         """Return the trained ranges of velocity by the names of the command's parameters."""
         parameters = self._agent(self.label).task.command.parameters
         return {name: tuple(v) for name, v in parameters.items() if isinstance(v, tuple | list) and len(v) == 2}
-
-    def velocity(self, seconds: float = 0.5) -> Vector:
-        """Return the mean true velocity (3,) of the last ``seconds`` s: x and y, m/s, and yaw rate, rad/s."""
-        return np.asarray(self.history.last("true", seconds).mean(0))
 
 
 def one_push(start: float, impulse: float, direction: float) -> Impulses:

@@ -14,9 +14,8 @@ from go1exp.base.report import plots
 from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Played
+from go1exp.evaluate.protocol.base import ERRORS, Played, Steady
 from go1exp.evaluate.protocol.kinds.gait import straight
-from go1exp.evaluate.protocol.kinds.steady import ERRORS, Steady
 from go1exp.evaluate.protocol.plan import Motion
 from go1exp.evaluate.quantities import Column, Row, add_measures
 from go1exp.mdp.measures.trace import Trace, mean_over, percentile_over

@@ -13,8 +13,7 @@ from go1exp.base.report import plots
 from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Played, rounded
-from go1exp.evaluate.protocol.kinds.steady import ERRORS, Steady, by_axis, command_text
+from go1exp.evaluate.protocol.base import ERRORS, Played, Steady, by_axis, command_text, rounded
 from go1exp.evaluate.protocol.plan import Motion
 from go1exp.evaluate.quantities import Column, Row
 from go1exp.mdp.measures.gait import touchdown_phase

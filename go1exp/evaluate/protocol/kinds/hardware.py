@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import takewhile
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
@@ -13,11 +14,10 @@ from go1exp.base.report import plots
 from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Length, Played, lives
+from go1exp.evaluate.protocol.base import ERRORS, Length, Played, Steady, by_axis, lives
 from go1exp.evaluate.protocol.claims import evaluated
 from go1exp.evaluate.protocol.kinds.energy import POWER, effort
 from go1exp.evaluate.protocol.kinds.rate import LATEST_MS
-from go1exp.evaluate.protocol.kinds.steady import ERRORS, Steady, by_axis
 from go1exp.evaluate.protocol.plan import Motion, Plan
 from go1exp.evaluate.quantities import AXES, FELL, Column, Derived, Row, add_measures
 from go1exp.evaluate.quantities import summary as summarised
@@ -98,12 +98,9 @@ class Hardware(Steady):
 
 def _margin(rows: Sequence[Row]) -> float:
     """Return the largest delay (ms) up to which none of the rows fell; 0 also if one did without any."""
-    held = 0.0
-    for delay in sorted({row["delay_ms"] for row in rows}):
-        if any(row["fell"] for row in rows if row["delay_ms"] == delay):
-            break
-        held = float(delay)
-    return held
+    fell = {row["delay_ms"] for row in rows if row["fell"]}
+    held = takewhile(lambda delay: delay not in fell, sorted({row["delay_ms"] for row in rows}))
+    return float(max(held, default=0.0))
 
 
 def _items(hardware: Hardware, summary: Sequence[Mapping[str, Any]]) -> plots.Figure:

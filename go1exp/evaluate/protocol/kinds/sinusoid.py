@@ -13,8 +13,7 @@ from go1exp.base.report import plots
 from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import Positive, protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, bands, lives, repeated, rounded
-from go1exp.evaluate.protocol.kinds.steady import ERRORS
+from go1exp.evaluate.protocol.base import ERRORS, Cause, Length, Played, Protocol, bands, lives, repeated, rounded
 from go1exp.evaluate.protocol.plan import Motion, Plan, Sine, response
 from go1exp.evaluate.quantities import AXES, Column, Row
 
