@@ -25,14 +25,11 @@ from go1exp.config.schema.registry import ConfigError
 from go1exp.evaluate.viewer import requests as ask
 from go1exp.evaluate.viewer.page_server import Gate, instructions, listening
 from go1exp.evaluate.viewer.replay import (
-    Choose,
-    Magnify,
+    Change,
     Motion,
     Piece,
-    Play,
     Player,
     ReplayShow,
-    Seek,
     Story,
     of_recording,
     of_result,
@@ -350,11 +347,11 @@ def test_a_recording_is_shown_in_its_own_time(base: str) -> None:
     (target,) = show.view().ghosts
     assert target.name == "target"
     assert np.allclose(target.qpos[7:] - show.data.qpos[7:], 0.05)
-    show.ask(Seek(0.7))
+    show.ask(Change(time=0.7))
     assert not show.player.running
     show.tick()
     assert np.allclose(show.data.qpos[7:], log.joint("q")[350], atol=1e-9)
-    show.ask(Play(True, 1.0))
+    show.ask(Change(running=True, speed=1.0))
     for _ in range(20):
         show.tick()
     assert show.player.time < 0.7  # it begins again
@@ -393,8 +390,8 @@ def test_an_answer_is_shown_window_by_window() -> None:
     assert np.allclose(show.data.qpos[7:] - measured.qpos[7:], 20.0 * 4e-3)
     assert np.allclose(after.qpos[7:] - again.qpos[7:], 20.0 * 1e-3)
     assert np.linalg.norm(after.shift) > 0.5  # beside it
-    show.ask(Magnify(1.0))
-    show.ask(Choose(7))
+    show.ask(Change(magnify=1.0))
+    show.ask(Change(piece=7))
     show.tick()
     assert show.view().number == 1
     assert np.allclose(show.data.qpos[7:] - show.view().ghosts[0].qpos[7:], 4e-3)
@@ -409,11 +406,11 @@ def test_a_time_beyond_the_ends_is_an_end() -> None:
     t = np.linspace(0.0, 1.0, 11)
     piece = Piece("p", t, (Motion("measured", np.zeros((11, 1))),), {"q": {"j": {"measured": np.zeros(11)}}})
     player = Player(Story("log", "", (piece,)))
-    player.ask(Seek(99.0))
+    player.ask(Change(time=99.0))
     assert (player.time, player.row) == (1.0, 10)
-    player.ask(Seek(-1.0))
+    player.ask(Change(time=-1.0))
     assert (player.time, player.row) == (0.0, 0)
-    player.ask(Choose(-3))
+    player.ask(Change(piece=-3))
     assert player.number == 0
 
 

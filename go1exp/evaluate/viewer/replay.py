@@ -83,35 +83,14 @@ class Story:
 
 
 @dataclass(frozen=True)
-class Choose:
-    """Request another piece, by its number."""
+class Change:
+    """Request of the user; None keeps what there is."""
 
-    piece: int
-
-
-@dataclass(frozen=True)
-class Seek:
-    """Request another time, s from the beginning of the piece."""
-
-    time: float
-
-
-@dataclass(frozen=True)
-class Play:
-    """Request that time passes or stands still, at ``speed`` s of the recording per s."""
-
-    running: bool
-    speed: float
-
-
-@dataclass(frozen=True)
-class Magnify:
-    """Request another magnification of errors."""
-
-    times: float
-
-
-Request = Choose | Seek | Play | Magnify
+    piece: int | None = None  # number of the piece, which begins anew
+    time: float | None = None  # s from the beginning of the piece, where time then stands still
+    running: bool | None = None  # whether time passes
+    speed: float | None = None  # s of the recording per s
+    magnify: float | None = None  # factor by which errors are magnified
 
 
 class Player:
@@ -128,17 +107,18 @@ class Player:
         """The present piece."""
         return self.story.pieces[self.number]
 
-    def ask(self, request: Request) -> None:
+    def ask(self, request: Change) -> None:
         """Apply a request; times and numbers are clipped to their range."""
-        match request:
-            case Choose(piece):
-                self.number, self.time = min(max(piece, 0), len(self.story.pieces) - 1), 0.0
-            case Seek(time):
-                self.time, self.running = min(max(time, 0.0), self.piece.duration), False
-            case Play(running, speed):
-                self.running, self.speed = running, max(speed, SLOWEST)
-            case Magnify(times):
-                self.magnify = min(max(times, 1.0), MOST)
+        if request.piece is not None:
+            self.number, self.time = min(max(request.piece, 0), len(self.story.pieces) - 1), 0.0
+        if request.time is not None:
+            self.time, self.running = min(max(request.time, 0.0), self.piece.duration), False
+        if request.running is not None:
+            self.running = request.running
+        if request.speed is not None:
+            self.speed = max(request.speed, SLOWEST)
+        if request.magnify is not None:
+            self.magnify = min(max(request.magnify, 1.0), MOST)
 
     def advance(self, seconds: float) -> None:
         """Advance by real time; a piece repeats at its end."""
@@ -284,7 +264,7 @@ class ReplayShow:
         self._apart = wide * np.array([math.sin(math.radians(AZIMUTH)), -math.cos(math.radians(AZIMUTH)), 0.0])
         self._place()
 
-    def ask(self, request: Request) -> None:
+    def ask(self, request: Change) -> None:
         """Apply a request of the user."""
         self.player.ask(request)
 

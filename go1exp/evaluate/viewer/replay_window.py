@@ -10,8 +10,7 @@ import numpy as np
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.implot import implot
 
-from go1exp.evaluate.viewer import replay as ask
-from go1exp.evaluate.viewer.replay import MODELS, MOST, UNITS, Ghost, Piece, ReplayView, Story
+from go1exp.evaluate.viewer.replay import MODELS, MOST, UNITS, Change, Ghost, Piece, ReplayView, Story
 from go1exp.evaluate.viewer.window import Vec2, Window, paragraph, section
 
 COLOURS: dict[str, tuple[float, float, float, float]] = {
@@ -81,14 +80,14 @@ class ReplayWindow(Window):
         """Answer keys."""
         view: ReplayView = self.view
         if imgui.IsKeyPressed(imgui.Key.Space, False):
-            self.ask(ask.Play(not view.running, view.speed))
+            self.ask(Change(running=not view.running))
         step = 0.01 * self._story.pieces[view.number].duration
         for key, sign in ((imgui.Key.LeftArrow, -1.0), (imgui.Key.RightArrow, 1.0)):
             if imgui.IsKeyPressed(key):
-                self.ask(ask.Seek(view.time + sign * step))
+                self.ask(Change(time=view.time + sign * step))
         for key, sign in ((imgui.Key.UpArrow, -1), (imgui.Key.DownArrow, 1)):
             if imgui.IsKeyPressed(key):
-                self.ask(ask.Choose(view.number + sign))
+                self.ask(Change(piece=view.number + sign))
 
     def left(self) -> None:
         """Draw time line, pieces and joints."""
@@ -102,26 +101,26 @@ class ReplayWindow(Window):
         if len(self._story.pieces) > 1 and section("Held-out windows"):
             for k, other in enumerate(self._story.pieces):
                 if imgui.RadioButton(f"{other.title}##{k}", k == view.number):
-                    self.ask(ask.Choose(k))
+                    self.ask(Change(piece=k))
         if section("Joint: error of the angle, mrad"):
             self._joints(piece)
 
     def _time(self, view: ReplayView, piece: Piece) -> None:
         if imgui.Button("Pause" if view.running else "Play"):
-            self.ask(ask.Play(not view.running, view.speed))
+            self.ask(Change(running=not view.running))
         imgui.SameLine()
         imgui.SetNextItemWidth(80.0)
         near = min(range(len(SPEEDS)), key=lambda k: abs(SPEEDS[k] - view.speed))
         changed, index = imgui.Combo("speed", near, [f"{v:g}x" for v in SPEEDS])
         if changed:
-            self.ask(ask.Play(view.running, SPEEDS[index]))
+            self.ask(Change(speed=SPEEDS[index]))
         if self._story.kind == "log":  # the camera cannot follow two robots
             imgui.SameLine()
             _, self.follow = imgui.Checkbox("follow", self.follow)
         imgui.SetNextItemWidth(-40.0)
         changed, time = imgui.SliderFloat("s", view.time, 0.0, piece.duration, "%.3f")
         if changed:
-            self.ask(ask.Seek(time))
+            self.ask(Change(time=time))
         imgui.TextDisabled("space: play, pause")
         imgui.TextDisabled("arrows: time, window")
 
@@ -129,7 +128,7 @@ class ReplayWindow(Window):
         imgui.SetNextItemWidth(-110.0)
         changed, times = imgui.SliderFloat("magnified", view.magnify, 1.0, MOST, "%.0f times")
         if changed:
-            self.ask(ask.Magnify(times))
+            self.ask(Change(magnify=times))
         paragraph("errors in the scene only; curves and numbers are not magnified")
         _, self._ghosts_shown = imgui.Checkbox("measured, and after", self._ghosts_shown)
         paragraph("Left: before, the nominal model. Right, green: after, with the identified effects. Blue: measured.")
