@@ -99,7 +99,8 @@ def _show(
     if progress is None:
         video.live(core, policy)
         return
-    if video.length(settings.seconds, settings.fps) < 1:
+    count = round(settings.seconds * settings.fps)
+    if count < 1:
         raise ConfigError([f"seconds = {settings.seconds:g}: shorter than a picture at fps = {settings.fps}"])
     core.command.value[:] = core.command.value.new_tensor(settings.velocity)
     try:
@@ -113,7 +114,7 @@ def _show(
     if gif and (wrong := memory.too_long(settings.seconds, settings.fps * video.GIF_BYTES)):
         raise ConfigError([f"seconds = {settings.seconds:g}: a GIF {wrong}; an .mp4 of any length does"])
     panels: list[Picture] = []
-    kept = video.keeping(frames, video.length(settings.seconds, settings.fps), panels)
+    kept = video.keeping(frames, count, panels)
     (video.write_gif if gif else video.write_mp4)(out, kept, settings.fps)
     video.write_strip(out.with_suffix(".png"), panels)
     print(f"written to {out} and {out.with_suffix('.png')}")

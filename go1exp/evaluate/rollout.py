@@ -48,11 +48,6 @@ class EvalConfig:
     trunk_velocity: TrunkVelocity = "exact"
     engine: BackendConfig | None = None  # what moves the robots, or None for MuJoCo on the processor
 
-    @property
-    def random(self) -> bool:
-        """Whether episodes of one command differ."""
-        return self.noise or self.randomize or self.push or self.train_ground
-
 
 def evaluation_task(task: TaskConfig, config: EvalConfig) -> TaskConfig:
     """Return the task that evaluates a policy of ``task``, on the CPU; raise ConfigError if its two steps misfit."""
@@ -236,7 +231,7 @@ class _Tally:
         Where nothing is random, all did the same, whatever the last bits of a batched matrix product say.
         """
         first = k * config.episodes
-        if not config.random:
+        if not (config.noise or config.randomize or config.push or config.train_ground):
             return torch.tensor([first])
         robots = slice(first, first + config.episodes)
         sums = torch.cat([self.velocity_sum[robots], self.square_sum[robots], self.survived[robots, None].double()], 1)

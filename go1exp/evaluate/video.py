@@ -54,7 +54,7 @@ def record(
     width: int = WIDTH,
     height: int = HEIGHT,
 ) -> Iterator[Picture]:
-    """Reset the environments, run the policy, and yield the pictures (``length``) of one of them, one by one.
+    """Reset the environments, run the policy, and yield the pictures of one of them, one by one.
 
     ``seconds`` are simulated, with ``fps`` pictures each; where an episode ends, the next one follows. ``on_frame``
     gets the numbers of pictures done and of all. ``caption`` writes time, command and velocity (mean over 0.5 s) on
@@ -67,7 +67,7 @@ def record(
 
     def pictures() -> Iterator[Picture]:
         dt = core.task.sim.policy_dt
-        total, step = length(seconds, fps), 0
+        total, step = round(seconds * fps), 0
         try:
             observation = core.reset()
             measured = deque([planar_velocity(core)[env].tolist()], maxlen=max(1, round(AVERAGE_TIME / dt)))
@@ -96,11 +96,6 @@ def record(
             camera.close()
 
     return pictures()
-
-
-def length(seconds: float, fps: float) -> int:
-    """Return the number of pictures in a video of ``seconds`` at ``fps``."""
-    return round(seconds * fps)
 
 
 def evenly(total: int, count: int) -> list[int]:

@@ -50,13 +50,6 @@ def stepped(step: Callable[[torch.Tensor], object], num_envs: int) -> Subject:
     return work
 
 
-def env_subject(task: TaskConfig, num_envs: int) -> Subject:
-    """The whole environment step under random actions."""
-    core = Go1Core(task, num_envs)
-    core.reset()
-    return stepped(core.step, num_envs)
-
-
 def bare_subject(task: TaskConfig, num_envs: int) -> Subject:
     """MuJoCo Warp alone, as one graph: the same model with its sensors, a PD torque once a policy step, no MDP."""
     terrain = build_terrain(task.terrain)
@@ -128,7 +121,9 @@ def run(config: TrainConfig, overrides: list[str], much: Measured) -> dict[str, 
     if not config.task.backend.on_gpu:
         raise ConfigError(["suite=gpu needs backend=warp on a CUDA device"])
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, num_envs=much.num_envs))
-    subjects = {"bare": bare_subject(config.task, much.num_envs), "env": env_subject(config.task, much.num_envs)}
+    core = Go1Core(config.task, much.num_envs)
+    core.reset()
+    subjects = {"bare": bare_subject(config.task, much.num_envs), "env": stepped(core.step, much.num_envs)}
     training = learning(trainer.build(config), config, torch.cuda.synchronize)
     subjects |= {"train": training, "numpy": border_subject(config)}
     measured = rates(subjects, much)

@@ -10,7 +10,6 @@ from pydantic import Field
 from go1exp.config.schema.registry import ConfigError, NonNegative, Positive, unknown_name
 from go1exp.config.schema.settings import parse, settings
 
-Share = Annotated[float, Field(gt=0, lt=1)]
 Phase = Annotated[float, Field(ge=0, lt=1)]
 Weights = tuple[NonNegative, NonNegative, NonNegative]
 

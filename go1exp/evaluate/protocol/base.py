@@ -213,12 +213,8 @@ class Steady(Protocol):
 
     def lengths(self) -> list[Length]:
         """Return that of all commands as one batch."""
-        robots, recorded = self.robots * len(self.commands), bool(self.terms())
-        return [Length(self.seconds, robots, self.causes(), self.settle_s, recorded)]
-
-    def causes(self) -> list[Cause]:
-        """Return what says how long a batch plays."""
-        return [Cause("seconds", self.seconds, least=self.settle_s)]
+        causes, robots = [Cause("seconds", self.seconds, least=self.settle_s)], self.robots * len(self.commands)
+        return [Length(self.seconds, robots, causes, self.settle_s, bool(self.terms()))]
 
     def play(self, stage: Stage) -> Played:
         """Play all commands as one batch."""

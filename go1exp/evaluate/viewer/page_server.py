@@ -37,6 +37,8 @@ class Gate:
     def __init__(self, port: int) -> None:
         self.token = secrets.token_urlsafe(16)
         self._cookie = f"go1exp_{port}"  # cookies are shared by all ports of a host
+        # Value of ``Set-Cookie``: of this site's own requests alone, and not for the page's scripts.
+        self.header = f"{self._cookie}={self.token}; Path=/; HttpOnly; SameSite=Strict"
 
     def admits(self, path: str, cookie: str, origin: str | None, host: str) -> bool:
         """Return whether a request may pass, by its path with query and three of its headers."""
@@ -49,11 +51,6 @@ class Gate:
         query = urllib.parse.parse_qs(urllib.parse.urlsplit(path).query)
         given = [*query.get("token", ()), *([kept.value] if kept else ())]
         return any(secrets.compare_digest(word.encode(), self.token.encode()) for word in given)
-
-    @property
-    def header(self) -> str:
-        """Value of ``Set-Cookie``: of this site's own requests alone, and not for the page's scripts."""
-        return f"{self._cookie}={self.token}; Path=/; HttpOnly; SameSite=Strict"
 
     def guarded(self, process: Callable[..., Awaitable[Any] | Any]) -> Callable[..., Coroutine[Any, Any, Any]]:
         """Return a ``process_request`` of a server of the package ``websockets`` that answers 403 to the others."""

@@ -23,7 +23,6 @@ from go1exp.evaluate.viewer import requests
 from go1exp.evaluate.viewer.requests import Ground, Setup, task_under
 from go1exp.mdp.derived import clipped
 from go1exp.sim.env.core import Go1Core
-from go1exp.sim.task import TaskConfig
 
 Array = NDArray[np.float64]
 
@@ -107,7 +106,7 @@ class Session:
         self.robots, self.command = robots, velocity
         self._loaded: dict[str, Agent] = {}
         self.paused, self.speed, self.time, self.falls = False, 1.0, 0.0, 0
-        self._history: History | None = None
+        self.history = History({}, math.inf)  # the curves
         self.rewards: tuple[str, ...] = ()
         self.message, self.push = "", PushMade(-math.inf, 0.0, 0.0)
         self._since, self._single = 0.0, False
@@ -121,16 +120,12 @@ class Session:
             self._loaded[label] = self.robots.agents[label]()
         return self._loaded[label]
 
-    def task_of(self, label: str, setup: Setup) -> TaskConfig:
-        """Return the task of a policy under ``setup``; raise ConfigError if they are incompatible."""
+    def _build(self, label: str, setup: Setup) -> None:
+        """Build another policy or setup; nothing changes unless all of it can be built, else raise ConfigError."""
         agent = self._agent(label)
         if problems := agent.problems(setup.trunk_velocity, "trunk_velocity"):
             raise ConfigError(problems)
-        return task_under(agent.task, setup, self.robots.grounds, self.robots.effects)
-
-    def _build(self, label: str, setup: Setup) -> None:
-        """Build another policy or setup; nothing changes unless all of it can be built."""
-        task, agent = self.task_of(label, setup), self._agent(label)
+        task = task_under(agent.task, setup, self.robots.grounds, self.robots.effects)
         require_agreement(task)
         core = Go1Core(task, 1, setup.seed, noise=setup.noise, imu=True)
         policy = agent.begin(core, setup.trunk_velocity, setup.seed)
@@ -144,8 +139,8 @@ class Session:
         names = tuple(t.key for t in core.terms.rewards)
         widths = {"command": 3, "true": 3, "estimated": 3, "height": 1, "torque": 12, "contact": 4, "push": 1}
         widths["reward"] = len(names)
-        if self._history is None or (self.rewards, self._history.dt) != (names, self.dt):
-            self._history = History(widths, self.dt)
+        if (self.rewards, self.history.dt) != (names, self.dt):
+            self.history = History(widths, self.dt)
         self.rewards = names
 
     def _begin(self) -> None:
@@ -231,12 +226,6 @@ class Session:
         self._kicker.use(one_push(self._kicker.time, impulse, direction))
         angle = float(heading(self.core.backend.qpos[:, 3:7])[0]) + direction
         self.push = PushMade(self.time, impulse, angle)
-
-    @property
-    def history(self) -> History:
-        """The curves."""
-        assert self._history is not None
-        return self._history
 
     @property
     def dt(self) -> float:

@@ -119,7 +119,10 @@ class SimShow:
         truth = {name: rows[:, k] for k, name in enumerate(TRUTH)}
         place = np.stack([truth["base_pos_x_w"], truth["base_pos_y_w"]], axis=1)
         below = self._terrain.height_at(np.nan_to_num(place))
-        true = np.column_stack([*in_trunk(truth), truth["base_ang_vel_z_b"]])
+        quat = torch.from_numpy(np.stack([truth[f"base_quat_{part}"] for part in "wxyz"], axis=1))
+        velocity = torch.from_numpy(np.stack([truth[f"base_lin_vel_{axis}_w"] for axis in "xyz"], axis=1))
+        planar = rotate_inverse(quat, velocity).numpy()[:, :2]  # in the trunk's frame
+        true = np.column_stack([planar, truth["base_ang_vel_z_b"]])
         torque, contact = np.abs(rows[:, TORQUE]) / self._limit, (rows[:, FORCE] > 0.0).astype(float)
         height = truth["base_pos_z_w"] - below
         together = zip(height, true, torque, contact, strict=True)
@@ -172,14 +175,6 @@ def longest(t: Array, values: Array, most: int) -> tuple[Array, Array]:
     starts = range(0, len(t), every)
     chosen = np.array([k + int(np.argmax(values[k : k + every])) for k in starts])
     return t[chosen], values[chosen]
-
-
-def in_trunk(truth: dict[str, Array]) -> tuple[Array, Array]:
-    """Return the trunk's velocity forward and to the left, (R,) each, m/s, of columns of ``server.TRUTH``."""
-    quat = np.stack([truth[f"base_quat_{part}"] for part in "wxyz"], axis=1)
-    velocity = np.stack([truth[f"base_lin_vel_{axis}_w"] for axis in "xyz"], axis=1)
-    forward, left, _ = rotate_inverse(torch.from_numpy(quat), torch.from_numpy(velocity)).numpy().T
-    return forward, left
 
 
 PACKETS = 150.0  # height of the plot of intervals, pixels

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import takewhile
@@ -52,8 +53,8 @@ class Hardware(Steady):
 
     def lengths(self) -> list[Length]:
         """Return the lengths of the commands without and with further delays."""
-        late = self.robots * len(self.commands) * len(self.delays_ms)
-        return [*Steady.lengths(self), Length(self.seconds, late, self.causes(), self.settle_s)]
+        (usual,) = Steady.lengths(self)
+        return [usual, dataclasses.replace(usual, robots=usual.robots * len(self.delays_ms), recorded=False)]
 
     def play(self, stage: Stage) -> Played:
         """Play the commands without further delays, and again with them, for falls alone."""
