@@ -47,7 +47,7 @@ ORDER = {
     "deploy": ("estimation", "runtime", "__main__.py", "export", "sim_robot"),
     "evaluate": (
         *("statistics", "quantities.py", "controller", "recorder.py", "agents.py"),
-        *("rollout.py", "footfalls.py", "video.py", "criteria.py", "table.py", "asynchronous.py"),
+        *("rollout.py", "video.py", "criteria.py", "table.py", "asynchronous.py"),
         *("protocol", "report", "bench", "viewer"),
     ),
 }

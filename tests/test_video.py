@@ -17,8 +17,20 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from go1exp.evaluate.footfalls import FIRST_RGB, GROUND_RGB, SECOND_RGB, SPAN, Footfalls
-from go1exp.evaluate.video import keeping, live, record, steer, write_gif, write_mp4, write_strip
+from go1exp.evaluate.video import (
+    FIRST_RGB,
+    GROUND_RGB,
+    SECOND_RGB,
+    SPAN,
+    Footfalls,
+    keeping,
+    live,
+    record,
+    steer,
+    write_gif,
+    write_mp4,
+    write_strip,
+)
 from go1exp.sim.env import camera as camera_module
 from go1exp.sim.env.camera import GROUND_RANGE, Camera, Picture, RenderingUnavailable, Stage, choose_gl
 from go1exp.sim.env.core import Go1Core

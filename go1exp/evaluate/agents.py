@@ -87,8 +87,7 @@ class VelocityFilters:
     def __init__(self, core: Go1Core, noise: bool, seed: int) -> None:
         """Observe the plant of ``core``, built with ``imu=True``; raise EstimatorError if the filter is not built.
 
-        ``noise`` adds the sensor noise of the paper's Table II, and a logger's to accelerometer and feet, drawn by
-        ``seed``.
+        ``noise`` adds the noise of the paper's Table II, and a logger's to accelerometer and feet, drawn by ``seed``.
         """
         self._filters, self._columns = Filters(core.num_envs), columns(core.task, TERM)
         self._plant, self._dt, self._steps = core.plant, core.task.sim.physics_dt, 0

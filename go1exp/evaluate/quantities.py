@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 Condition = tuple[Any, ...]
-
 AXES = ("x", "y", "yaw")  # of a command, and its columns: m/s, m/s, rad/s
 ROBOT = "robot"  # column with the robot's number: the same number is the same robot in all conditions' draws
 FINGERPRINT = "fingerprint"  # column with a number that two robots share only if they did the same, bit for bit

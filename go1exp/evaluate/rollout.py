@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
 
@@ -14,7 +14,7 @@ from go1exp.base import memory
 from go1exp.base.wording import counted
 from go1exp.config.schema.physics import BackendConfig, CpuBackend
 from go1exp.config.schema.registry import ConfigError, Term, TooLongError, members
-from go1exp.evaluate.agents import Agent, ControllerAgent, PolicyAgent
+from go1exp.evaluate.agents import ControllerAgent, PolicyAgent
 from go1exp.evaluate.controller.types import Command, Controller, TrunkVelocity
 from go1exp.evaluate.quantities import AXES, described, drawn, rows_of, share
 from go1exp.evaluate.recorder import Recorder, bytes_per_second
@@ -99,7 +99,7 @@ def evaluate(
     large, TooLongError if what measures need does not fit into memory, ConfigError if ``settle_s`` leaves no step.
     """
     count = len(config.commands) * config.episodes
-    agent = _agent(task, policy, controller)
+    agent = ControllerAgent("", task, controller) if controller else PolicyAgent("", task, cast(Policy, policy))
     imu = config.trunk_velocity == "estimated" or agent.senses
     task = evaluation_task(task, config)
     _refuse_too_long(config, bytes_per_second(task, count) if measures else 0.0, count)
@@ -164,13 +164,6 @@ def _refuse_too_long(config: EvalConfig, rate: float, count: int) -> None:
     raise TooLongError([f"{key}: {what}; {fitting} at most would fit; measures=[] needs none of it"])
 
 
-def _agent(task: TaskConfig, policy: Policy | None, controller: Callable[[], Controller] | None) -> Agent:
-    if controller is not None:
-        return ControllerAgent("", task, controller)
-    assert policy is not None  # or there would be a controller
-    return PolicyAgent("", task, policy)
-
-
 def planar_velocity(core: Go1Core) -> torch.Tensor:
     """Return the velocity of the trunk in its own frame (N, 3), float64: x and y in m/s, yaw rate in rad/s."""
     s = core.snapshot()
@@ -226,10 +219,7 @@ class _Tally:
         }
 
     def distinct(self, k: int, config: EvalConfig) -> torch.Tensor:
-        """Return the robots of command ``k`` that did not do what one before them did: indices, ascending.
-
-        Where nothing is random, all did the same, whatever the last bits of a batched matrix product say.
-        """
+        """Return the robots of command ``k`` without repeats (``quantities.distinct``): indices, ascending."""
         first = k * config.episodes
         if not (config.noise or config.randomize or config.push or config.train_ground):
             return torch.tensor([first])

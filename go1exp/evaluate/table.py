@@ -11,7 +11,6 @@ from go1exp.evaluate.criteria import Verdict, evaluated
 from go1exp.evaluate.quantities import AXES, coarse_note
 
 HEADER = ("command x, y, yaw", "mean x, y, yaw", "RMSE x, y, yaw", "falls", "mean time s")
-
 Show = Callable[[Any], str]  # text of one cell from the entry of a measure in a report, which may be None
 Columns = dict[str, tuple[str, Show]]  # header -> measure and its format
 NO_FIGURE = "-"

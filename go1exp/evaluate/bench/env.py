@@ -103,10 +103,7 @@ def core_subject(task: TaskConfig, num_envs: int) -> Subject:
 
 
 def bare_subject(task: TaskConfig, num_envs: int) -> Subject:
-    """MuJoCo's batch alone: the same model with its sensors, a PD torque once a policy step, no MDP.
-
-    The torques are computed once per policy step and held, so that nothing but physics is timed between substeps.
-    """
+    """MuJoCo's batch alone: the same model with its sensors, a PD torque held for each policy step, no MDP."""
     terrain = build_terrain(task.terrain)
     model, _ = build_model(task.robot, terrain, task.sim.physics_dt, contact=task.contact)
     batch = Batch(model, num_envs, nthread=task.backend.as_reference().threads)

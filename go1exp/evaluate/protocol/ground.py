@@ -33,7 +33,6 @@ RESOLUTION = 0.05  # pitch of the samples, m: that of the gravel
 TREAD = 0.31  # depth of a stair, m (legged_gym)
 WAVE_LENGTH = 1.0  # m
 BOX = 0.45  # edge of a box, m (Isaac Lab)
-
 Field = NDArray[Any]
 
 

@@ -23,7 +23,6 @@ from go1exp.evaluate.statistics.runs import ORDER as COMPARED
 
 Entry = Mapping[str, Any]
 Meanings = Mapping[str, str]
-
 ACROSS = 5  # most columns of quantities in a table, so that it fits on paper
 MANY = 8  # largest number of conditions that are columns; more are rows
 COMMAND = ("x", "y", "yaw")

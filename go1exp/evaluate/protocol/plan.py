@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 Array = NDArray[np.float64]
-
 Velocity = tuple[Speed, Speed, Speed]  # x and y in m/s, yaw rate in rad/s, body frame
 
 Impulse = Annotated[float, Field(gt=0), within(0.0, 500.0, "N s")]

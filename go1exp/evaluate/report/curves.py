@@ -13,7 +13,6 @@ from go1exp.evaluate.report.study import Group
 from go1exp.evaluate.statistics.runs import iqm_band
 
 Floats = NDArray[np.float64]
-
 RATE = "time/steps_per_s"
 STEPS, HOURS = "steps", "hours"
 AXES = {STEPS: "million environment steps", HOURS: "hours of training"}  # column of the x axis -> its label

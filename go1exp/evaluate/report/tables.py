@@ -7,7 +7,6 @@ from typing import Any
 
 from go1exp.base.report.table import NOTHING, Cell, Table, interval_text, number, spread, verdict
 from go1exp.evaluate.protocol.pages import condition_text, named
-from go1exp.evaluate.quantities import Column
 from go1exp.evaluate.report.results import Figure, Outcome, Report, Verdict
 from go1exp.evaluate.statistics.intervals import Interval
 from go1exp.evaluate.statistics.runs import ORDER, RESAMPLES
@@ -34,13 +33,7 @@ COMPARED = (
 
 MOST_KEYS = 5  # settings of groups that have columns of their own; more are in the CSV file
 MOST_COLUMNS = 6  # columns of the table of quantities
-
 SOURCES = {"setting": "swept", "drawn": "randomised"}  # source of a sensitivity -> its word
-
-
-def label(column: Column) -> str:
-    """Return a quantity with its unit."""
-    return named(column.name, column.unit)
 
 
 def tables(made: Report) -> list[Table]:
@@ -85,7 +78,7 @@ def _verdicts(outcome: Outcome, baseline: str) -> Table:
         d = v.difference
         rows.append(
             [
-                Cell(v.group, label(v.column), "name"),
+                Cell(v.group, named(v.column.name, v.column.unit), "name"),
                 verdict(v.word),
                 *map(_defined, (v.first, v.other)),
                 _interval(d.estimate),
@@ -121,7 +114,7 @@ def _figures(outcome: Outcome, made: Report) -> Table:
             robots = interval_text(f.robots.estimate, f.robots.low, f.robots.high).partition(" ")[2] if f.robots else ""
             cells.append(_interval(f.runs, f"n {f.runs.n}" + (f", robots: {robots}" if f.robots else "")))
         rows.append([group.name, *cells])
-    return Table(f"{evaluation.name}: results", ["group", *map(label, columns)], rows, FIGURES)
+    return Table(f"{evaluation.name}: results", ["group", *(named(c.name, c.unit) for c in columns)], rows, FIGURES)
 
 
 def _sensitivities(outcome: Outcome) -> Table:

@@ -9,22 +9,20 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from go1exp.base.files import write_json, write_text
+from go1exp.base.report import plots
 from go1exp.base.report.page import Page, provenance, render, sections
 from go1exp.base.report.plots import COLOURS, WIDE, Drawing, band, legend, listing, panels
 from go1exp.base.wording import counted
-from go1exp.evaluate.protocol.pages import by_word
+from go1exp.evaluate.protocol.pages import by_word, named
 from go1exp.evaluate.quantities import finite
 from go1exp.evaluate.report.curves import AXES, Curve
 from go1exp.evaluate.report.results import Figure, Report, Sensitivity
-from go1exp.evaluate.report.tables import SOURCES, PlainRow, about_baseline, label, plain_rows, tables
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure as Painting
+from go1exp.evaluate.report.tables import SOURCES, PlainRow, about_baseline, plain_rows, tables
 
 NOTES = (
     "A run is one training seed, and intervals are over runs: robots moved by one policy are no independent samples of"
@@ -133,7 +131,7 @@ def learning(curves: Sequence[Curve], baseline: str, of_groups: Looks) -> list[D
     return drawings
 
 
-def _learning(curves: Sequence[Curve], baseline: str, of_groups: Looks) -> Painting:
+def _learning(curves: Sequence[Curve], baseline: str, of_groups: Looks) -> plots.Figure:
     axes_drawn = [axis for axis in AXES if any(c.axis == axis for c in curves)]
     names = list(dict.fromkeys(c.group for c in curves))
     figure, axes = panels(1, len(axes_drawn), height=2.9, width=WIDE, sharey=True)
@@ -174,13 +172,15 @@ def forests(figures: Sequence[Figure], main: Sequence[str], baseline: str, key: 
                 f"Dashed: {baseline}."
             )
             paint = partial(_forest, those, baseline, of_groups)
-            title = f"{key}: {label(those[0].column)}"
+            title = f"{key}: {named(those[0].column.name, those[0].column.unit)}"
             drawings.append(Drawing(f"forest{key}{name}".replace("_", ""), title, caption, paint))
     return drawings
 
 
-def _forest(figures: Sequence[Figure], baseline: str, of_groups: Looks) -> Painting:
-    figure, panel = listing([short(f.group, 34) for f in figures], row=0.27, label=label(figures[0].column))
+def _forest(figures: Sequence[Figure], baseline: str, of_groups: Looks) -> plots.Figure:
+    figure, panel = listing(
+        [short(f.group, 34) for f in figures], row=0.27, label=named(figures[0].column.name, figures[0].column.unit)
+    )
     for place, f in enumerate(figures):
         colour, _ = of_groups[f.group]
         panel.plot(f.values, np.full(len(f.values), place), ".", color=colour, alpha=0.45, ms=5, mec="none")
@@ -214,7 +214,7 @@ def importances(entries: Sequence[Sensitivity], key: str) -> list[Drawing]:
     return drawings
 
 
-def _bars(entries: Sequence[Sensitivity]) -> Painting:
+def _bars(entries: Sequence[Sensitivity]) -> plots.Figure:
     names = [f"{short(e.association.name, 34)}, {SOURCES[e.source]}" for e in entries]
     figure, panel = listing(names, label="importance")
     colours = [COLOURS[0] if e.adjusted_p <= 0.05 else "#b9c6d0" for e in entries]

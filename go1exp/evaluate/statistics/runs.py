@@ -23,7 +23,6 @@ from go1exp.evaluate.statistics.intervals import LEVEL, POWER, Interval, constan
 TRIM = 0.25  # share of the values that the interquartile mean omits at each end
 WINSORISED_FROM = 6  # least number of runs with a winsorised standard error
 SIMULATED = 40_000  # normal samples for a critical value, which is then accurate to 1 %
-
 Floats = NDArray[np.float64]
 
 
@@ -118,11 +117,8 @@ def share_bootstrap(counts: ArrayLike, totals: ArrayLike) -> Interval:
 
 Word = Literal["better", "worse", "no significant difference"]
 Direction = Literal["lower", "higher"]
-
 ORDER: tuple[Word, ...] = ("better", "worse", "no significant difference")
-
 RESAMPLES = 20_000  # permutations of a test; where there are fewer, all of them
-
 LEAST_RANDOM_P = 2.0 / (RESAMPLES + 1)  # smallest two-sided p of random permutations, which include the observed one
 ALPHA = 1.0 - LEVEL
 

@@ -36,7 +36,6 @@ VELOCITIES = ("exact", "estimated")
 VELOCITY_AXES = (("x", "m/s"), ("y", "m/s"), ("yaw", "rad/s"))
 SPARK = 22.0  # height of a reward's curve, pixels
 GOOD, BAD = imgui.Vec4(0.35, 0.75, 0.4, 0.9), imgui.Vec4(0.9, 0.4, 0.3, 0.9)
-
 HELP = ("arrows: forward, back, yaw", "comma, full stop: left, right", "0 zero, P push, space pause")
 
 
@@ -54,7 +53,7 @@ class DriveWindow(LiveWindow):
         for key, code in KEYS.items():
             if imgui.IsKeyPressed(key):
                 steer(self._command, code)
-        self._bounded(view)
+        self._command = [min(max(v, a), b) for v, (a, b) in zip(self._command, view.limits, strict=True)]
         if self._command != before:
             self._steer()
         if imgui.IsKeyPressed(imgui.Key.Space, False):
@@ -74,9 +73,6 @@ class DriveWindow(LiveWindow):
             self._steer()
         for _ in range(presses.count(PUSH)):
             self.push()
-
-    def _bounded(self, view: WalkView) -> None:
-        self._command = [min(max(v, a), b) for v, (a, b) in zip(self._command, view.limits, strict=True)]
 
     def _steer(self) -> None:
         x, y, yaw = self._command
@@ -124,7 +120,8 @@ class DriveWindow(LiveWindow):
         imgui.SameLine()
         _, self.follow = imgui.Checkbox("follow", self.follow)
         imgui.SetNextItemWidth(70.0)
-        changed, index = imgui.Combo("speed", _nearest(SPEEDS, pace.speed), [f"{v:g}x" for v in SPEEDS])
+        near = min(range(len(SPEEDS)), key=lambda k: abs(SPEEDS[k] - pace.speed))
+        changed, index = imgui.Combo("speed", near, [f"{v:g}x" for v in SPEEDS])
         if changed:
             self.ask(ask.Pace(pace.paused, SPEEDS[index]))
         imgui.SameLine()
@@ -247,7 +244,3 @@ class DriveWindow(LiveWindow):
             implot.PlotLine("value", list(range(len(reward.curve))), reward.curve)
             implot.EndPlot()
         implot.PopStyleVar()
-
-
-def _nearest(values: tuple[float, ...], value: float) -> int:
-    return min(range(len(values)), key=lambda k: abs(values[k] - value))

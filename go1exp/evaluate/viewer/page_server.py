@@ -21,9 +21,7 @@ from typing import Any
 from go1exp.base.errors import Expected
 
 FIRST_PORT, PORTS = 8080, 20  # first port and number of ports of the search for a free one
-
 REFUSAL = "go1exp: open the address that the command printed; without the token in it nothing is shown\n"
-
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 
@@ -75,8 +73,7 @@ class Gate:
 def listening(host: str, port: int) -> socket.socket:
     """Return a socket that listens on ``host``, at ``port`` or for 0 at the first free one from ``FIRST_PORT`` on.
 
-    Raises:
-        Expected: if there is none, or the host is not of this machine.
+    Raise Expected if there is none, or the host is not of this machine.
     """
     try:
         about = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]

@@ -21,9 +21,7 @@ from go1exp.sim.physics.scene import build_model
 from go1exp.sim.terrain import TerrainConfig, build_terrain
 
 Array = NDArray[np.float64]
-
 UNITS = {"q": "rad", "qd": "rad/s", "q_target": "rad", "tau_est": "N m", "tau_cmd": "N m"}
-
 STEP_S = 0.02  # real time between two frames, s
 SLOWEST = 0.05  # s of the recording per s
 

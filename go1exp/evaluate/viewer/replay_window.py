@@ -21,11 +21,8 @@ COLOURS: dict[str, tuple[float, float, float, float]] = {
 """Of the robots beside the model's own: red, green, blue, opacity."""
 
 SPEEDS = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0)
-
 NAMES = {"q": "angle", "qd": "velocity", "tau_est": "torque, reported", "tau_cmd": "torque, commanded"}
-
 HEIGHT = 165.0  # of a plot, pixels
-
 NOW = imgui.Vec4(1.0, 1.0, 1.0, 0.6)
 
 

@@ -25,7 +25,6 @@ from go1exp.mdp.derived import clipped
 from go1exp.sim.env.core import Go1Core
 
 Array = NDArray[np.float64]
-
 SPAN = 10.0  # duration of a curve, s
 
 
@@ -73,7 +72,6 @@ class History:
 
 PUSH_S = 0.1  # duration of a push, s
 PUSH_SHOWN_S = 0.6  # time for which its arrow is shown, s
-
 Vector = NDArray[np.float64]
 
 

@@ -32,7 +32,6 @@ from go1exp.evaluate.viewer.requests import active, catalogue
 from go1exp.evaluate.viewer.session import PushMade, one_push
 
 Array = NDArray[np.float64]
-
 EVERY = 5  # ticks from row to row
 ROW_S = EVERY * TICK
 KEPT_S = 2.0  # time that is kept for a page that does not ask, s; older rows are a gap in its curves

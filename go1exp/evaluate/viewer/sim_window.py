@@ -29,9 +29,7 @@ from go1exp.sim.env.core import Go1Core
 from go1exp.sim.terrain import build_terrain
 
 LOOK_S = 1.0 / 30.0  # period at which the robot is looked at, s
-
 Array = NDArray[np.float64]
-
 WIDTHS = {"height": 1, "velocity": 3, "torque": 12, "contact": 4}  # columns of the curves
 MOST_POINTS = 1000  # most intervals that are drawn: of a faster client the longest of each group
 

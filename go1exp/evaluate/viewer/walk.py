@@ -18,13 +18,11 @@ from go1exp.sim.env.camera import ARROW_SCALE, COMMAND_RGB, LEAST_DRAWN, MEASURE
 
 VIEWS_PER_S = 25.0  # rate at which the panels get new curves, Hz
 PAUSED_S = 0.02  # time between two calls while paused, s
-
 PUSH_RGB, PUSH_SCALE = (1.0, 0.35, 0.2), 0.012  # colour of the arrow of a push; its length per impulse, m / (N s)
 FALLBACK = ((-1.5, 2.0), (-1.0, 1.0), (-1.5, 1.5))  # range of the sliders of a run without trained ranges
 RANGES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")  # parameters of a command term that are ranges of velocity
 CURVE_POINTS = 250  # points of a curve: about one a pixel
 SPARK_POINTS = 100  # points of a reward's small curve
-
 Vector = NDArray[np.float64]
 Series = list[list[float]]
 

@@ -24,7 +24,6 @@ from go1exp.sim.env.camera import AZIMUTH, DISTANCE, ELEVATION
 
 LEFT, RIGHT = 0.23, 0.42  # width of the panels: the left one's share of the window, and the right one's of what is left
 ARROW_WIDTH = 0.013  # m
-
 Vec2 = imgui.Vec2
 
 
@@ -156,21 +155,17 @@ PLOT, TALL, ROW = 110.0, 250.0, 15.0  # height of a plot, of one with a line for
 PLAIN = int(implot.Flags.NoMenus) | int(implot.Flags.NoBoxSelect) | int(implot.Flags.NoMouseText)
 FOOT, PUSHED = imgui.Vec4(0.45, 0.7, 1.0, 1.0), imgui.Vec4(1.0, 0.45, 0.2, 0.8)
 SLOW = imgui.Vec4(1.0, 0.7, 0.3, 1.0)
-
 Line = tuple[str, Sequence[float]]
 
 
 class LiveWindow(Window):
-    """Base of the windows of a robot that moves: pushes, effects, arrows and curves.
-
-    ``places`` of controls on the page are left, top, right, bottom, pixels.
-    """
+    """Base of the windows of a robot that moves: pushes, effects, arrows and curves."""
 
     def __init__(self) -> None:
         super().__init__("Robot", "Curves")
         self._impulse, self._direction = 20.0, 90.0
         self._drafts: dict[str, float] = {}  # values of sliders that are not released yet
-        self.places: dict[str, tuple[float, float, float, float]] = {}
+        self.places: dict[str, tuple[float, float, float, float]] = {}  # of controls: left, top, right, bottom, pixels
 
     def keys(self) -> None:
         """Push by P, reset by Backspace."""

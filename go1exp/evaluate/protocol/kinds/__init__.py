@@ -1,7 +1,5 @@
 """The protocols. Importing the package registers every kind, from this explicit list."""
 
-from __future__ import annotations
-
 from go1exp.evaluate.protocol.kinds import corners, energy, gait, hardware, kicks, push_map, rate, sinusoid, terrain
 
 __all__ = ["corners", "energy", "gait", "hardware", "kicks", "push_map", "rate", "sinusoid", "terrain"]

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from go1exp.base.report import plots
-from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import ERRORS, Played, Steady, bands, by_axis, command_text, rounded
@@ -54,15 +53,15 @@ class Corners(Steady):
             shares[command_text(by_axis(command))] = rounded(bands(along, np.nanmean)[0])
         return {"t": rounded(motion.t), "along": shares}
 
-    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
+    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[plots.Drawing]:
         """Draw the answers of all subjects."""
         text = "Share of each command that is reached, 95 % intervals over robots still standing; red: falls."
-        return [Drawing("answer", "Steady-state velocity", text, partial(_answers, summaries))]
+        return [plots.Drawing("answer", "Steady-state velocity", text, partial(_answers, summaries))]
 
-    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[plots.Drawing]:
         """Draw the steps."""
         text = f"Mean share of the command over robots still standing, from rest at {self.rest_s:g} s."
-        return [Drawing("steps", "Steps from rest", text, partial(_steps, played.curves))]
+        return [plots.Drawing("steps", "Steps from rest", text, partial(_steps, played.curves))]
 
 
 def step_answer(along: NDArray[Any], step: int, settle: int, dt: float) -> Row:

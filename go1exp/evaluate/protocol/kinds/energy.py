@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from go1exp import robot
 from go1exp.base.report import plots
-from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import ERRORS, Played, Steady
@@ -67,19 +66,19 @@ class Energy(Steady):
             dots[kind] = np.concatenate([sample, extremes]).round(3).tolist()
         return {"scatter": dots}
 
-    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
+    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[plots.Drawing]:
         """Draw the cost of transport over speed."""
         text = "Mechanical work over weight and distance; commands straight ahead and back; 95 % intervals."
-        return [Drawing("cost", "Cost of transport over speed", text, partial(_cost, summaries))]
+        return [plots.Drawing("cost", "Cost of transport over speed", text, partial(_cost, summaries))]
 
-    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[plots.Drawing]:
         """Draw torque over speed."""
         text = (
             "Dots: all robots and commands, drawn at random, and the 50 largest torques."
             " Solid: peak torque and top speed. Dashed: the line from peak torque at rest to top speed, which is"
             " pessimistic."
         )
-        return [Drawing("scatter", "Torque over speed", text, partial(_scatter, played.curves["scatter"]))]
+        return [plots.Drawing("scatter", "Torque over speed", text, partial(_scatter, played.curves["scatter"]))]
 
 
 def effort(trace: Trace) -> dict[str, NDArray[np.float64]]:

@@ -10,7 +10,6 @@ import numpy as np
 
 from go1exp import robot
 from go1exp.base.report import plots
-from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import ERRORS, Played, Steady, by_axis, command_text, rounded
@@ -65,12 +64,12 @@ class Gait(Steady):
             feet[command_text(by_axis(command))] = {"stances": stances, "phases": rounded(phases[robots])}
         return {"feet": feet}
 
-    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
+    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[plots.Drawing]:
         """Draw the gait of all subjects over speed."""
         text = "Commands straight ahead, with 95 % intervals over robots."
-        return [Drawing("speed", "Gait over speed", text, partial(_over_speed, summaries))]
+        return [plots.Drawing("speed", "Gait over speed", text, partial(_over_speed, summaries))]
 
-    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[plots.Drawing]:
         """Draw gait diagrams, and phases on the circle."""
         feet = played.curves["feet"]
         diagram = f"Bars: stance of one robot that does not fall, the last {SHOWN:g} s. Commands: m/s, rad/s."
@@ -79,8 +78,8 @@ class Gait(Steady):
             " are opposite, RL is with FR. Commands: m/s, rad/s."
         )
         return [
-            Drawing("diagram", "Gait diagram", diagram, partial(_diagram, feet)),
-            Drawing("circle", "Phases of the feet", circle, partial(_circle, feet)),
+            plots.Drawing("diagram", "Gait diagram", diagram, partial(_diagram, feet)),
+            plots.Drawing("circle", "Phases of the feet", circle, partial(_circle, feet)),
         ]
 
 

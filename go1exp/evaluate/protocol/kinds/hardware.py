@@ -12,7 +12,6 @@ import numpy as np
 from pydantic import Field
 
 from go1exp.base.report import plots
-from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import ERRORS, Length, Played, Steady, by_axis, lives
@@ -84,7 +83,7 @@ class Hardware(Steady):
         text = "largest command delay up to which no robot falls"
         return [Derived("delay_margin", "ms", text, {}, "higher", _margin)]
 
-    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[plots.Drawing]:
         """Draw each item against its limit, and falls over the delay."""
         bars = (
             "Figure of the worst command over its upper limit, 95 % interval; beyond the line the limit is not met."
@@ -92,8 +91,8 @@ class Hardware(Steady):
         )
         delay = "Share of robots of all commands that fell, with Wilson's 95 % interval."
         return [
-            Drawing("items", "Items against their limits", bars, partial(_items, self, summary)),
-            Drawing("delay", "Falls with command delay", delay, partial(_falls, played.rows)),
+            plots.Drawing("items", "Items against their limits", bars, partial(_items, self, summary)),
+            plots.Drawing("delay", "Falls with command delay", delay, partial(_falls, played.rows)),
         ]
 
 

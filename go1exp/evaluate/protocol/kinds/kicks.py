@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from go1exp.base.report import plots
-from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import NonNegative, Positive, protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, bands, lives, repeated, rounded
@@ -201,21 +200,21 @@ class Kicks(Protocol):
             curves[name] = rounded(bands(each, np.nanmedian))
         return curves
 
-    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
+    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[plots.Drawing]:
         """Draw the success of all subjects."""
         text = "Shares of robots with Wilson's 95 % interval."
-        return [Drawing("success", "Success", text, partial(_success, summaries))]
+        return [plots.Drawing("success", "Success", text, partial(_success, summaries))]
 
-    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[plots.Drawing]:
         """Draw the figure of the paper, at the rate of the policy and at 25 Hz, and the response of all robots."""
         run, around = played.curves["run"], played.curves["kicks"]
         rate, coarse = f"{1.0 / run['dt']:.0f} Hz", round(COARSE / run["dt"])
         one = "One robot: height of the trunk, its nominal height before the first kick, speed; dotted: kicks."
         every = "Robots standing before a kick, by the time since it: median, 10th to 90th percentile."
         return [
-            Drawing("run", f"Height and speed under kicks, at {rate}", one, partial(_run, run, 1)),
-            Drawing("coarse", "The same at 25 Hz, as the paper plots", one, partial(_run, run, coarse)),
-            Drawing("around", "Around each kick", every, partial(_around, around)),
+            plots.Drawing("run", f"Height and speed under kicks, at {rate}", one, partial(_run, run, 1)),
+            plots.Drawing("coarse", "The same at 25 Hz, as the paper plots", one, partial(_run, run, coarse)),
+            plots.Drawing("around", "Around each kick", every, partial(_around, around)),
         ]
 
 

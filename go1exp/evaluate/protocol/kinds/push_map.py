@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from go1exp.base.report import plots
-from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import Count, Positive, protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, lives
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
     from go1exp.evaluate.protocol.stage import Stage
 
 Array = NDArray[np.float64]
-
 LONGEST_STRIDE = 0.6  # time after the start in which two touchdowns of FR are looked for, twice, s
 LOOK_S = 2 * LONGEST_STRIDE  # time after settling in which the latest kick begins, s
 LEAST_SWING = 0.05  # s
@@ -137,18 +135,18 @@ class PushMap(Protocol):
         area = Derived("area", "(N s)^2", "area within the medians of all directions", {}, "higher", _area)
         return [*figures, area, Derived("weakest", "N s", "smallest median of all directions", {}, "higher", _weakest)]
 
-    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
+    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[plots.Drawing]:
         """Draw the maps of all subjects."""
         text = "Largest impulse without a fall, N s; up is forward: median with 95 % interval; dotted: 10th percentile."
-        return [Drawing("map", "Impulse map", text, partial(_map, summaries))]
+        return [plots.Drawing("map", "Impulse map", text, partial(_map, summaries))]
 
-    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[plots.Drawing]:
         """Draw the impulse over the phase of the gait."""
         text = (
             "Median over robots and directions, 10th to 90th percentile, by the phase in the stride of FR at which the"
             " kick begins; FR touches down at 0."
         )
-        return [Drawing("phase", "By gait phase", text, partial(_phases, played.rows))]
+        return [plots.Drawing("phase", "By gait phase", text, partial(_phases, played.rows))]
 
 
 def largest_survived(

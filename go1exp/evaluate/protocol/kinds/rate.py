@@ -10,7 +10,6 @@ import numpy as np
 from pydantic import Field
 
 from go1exp.base.report import plots
-from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import NonNegative, Positive, protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.controller.types import TrunkVelocity
@@ -128,10 +127,10 @@ class Rate(Protocol):
         difference = values(slow, "rmse_xy") - values(fast, "rmse_xy")
         return float(np.nanmean(difference)) if np.isfinite(difference).any() else np.nan
 
-    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
+    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[plots.Drawing]:
         """Draw errors, falls and action rate over the rate; of several subjects at the smallest delay."""
         text = "95 % intervals over robots that did not fall; a line for each delay, of several subjects the smallest."
-        return [Drawing("rate", "Error, falls and effort over the rate", text, partial(_over_rate, summaries))]
+        return [plots.Drawing("rate", "Error, falls and effort over the rate", text, partial(_over_rate, summaries))]
 
 
 def _rms(values: Any) -> float:

@@ -10,7 +10,6 @@ import numpy as np
 from pydantic import Field
 
 from go1exp.base.report import plots
-from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import Positive, protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import ERRORS, Cause, Length, Played, Protocol, bands, lives, repeated, rounded
@@ -97,22 +96,22 @@ class Sinusoid(Protocol):
                 row |= {f"{name}_{axis}": float(v[n, a]) if up and asked else None for name, v in figures.items()}
                 row[f"rmse_{axis}"] = float(rmse[n, a]) if up else None
 
-    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
+    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[plots.Drawing]:
         """Draw gain and lag of all subjects over frequency."""
         text = (
             "Gain 1 and lag 0 are perfect. 95 % intervals over robots; one line for each amplitude: x (m/s), y (m/s),"
             " yaw (rad/s), shifted sideways; colours of several subjects are theirs."
         )
-        return [Drawing("bode", "Gain and lag over frequency", text, partial(_bode, summaries))]
+        return [plots.Drawing("bode", "Gain and lag over frequency", text, partial(_bode, summaries))]
 
-    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[plots.Drawing]:
         """Draw the rows of the paper for each sine."""
         text = (
             "Black: commanded; blue: measured, thin of one robot, thick the mean of those still standing with the 10th"
             " to 90th percentile; orange: error of the mean."
         )
         return [
-            Drawing(f"sine{k}", f"Velocity, amplitude {name}", text, partial(_rows, curve))
+            plots.Drawing(f"sine{k}", f"Velocity, amplitude {name}", text, partial(_rows, curve))
             for k, (name, curve) in enumerate(played.curves["sines"].items())
         ]
 

@@ -10,7 +10,6 @@ import numpy as np
 from pydantic import Field
 
 from go1exp.base.report import plots
-from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import NonNegative, PositiveRange, Speed, protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, lives, repeated
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
     from go1exp.evaluate.protocol.stage import Stage
 
 SHARES = {"at_half": 0.5, "at_95": 0.95}
-
 LEAST_SLACK = 1.0  # of the time at the commanded speed: less is too little for every robot
 START_S = 1.0  # time that a robot has beside it, to begin, s
 
@@ -142,10 +140,10 @@ class OnTerrain(Protocol):
                     figures.append(Derived(key, UNITS[name], text, condition, "higher", function))
         return figures
 
-    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
+    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[plots.Drawing]:
         """Draw the curves of all subjects."""
         text = "Share that reached the end of its lane, Wilson's 95 % interval and logistic fit; slopes in degrees."
-        return [Drawing("success", "Success against difficulty", text, partial(_success, plays, summaries))]
+        return [plots.Drawing("success", "Success against difficulty", text, partial(_success, plays, summaries))]
 
 
 def _fit(rows: Sequence[Row]) -> Logistic | None:
