@@ -23,7 +23,7 @@ import torch
 
 from go1exp.deploy.export.build import build
 from go1exp.deploy.runtime import go1_wire as wire
-from go1exp.deploy.runtime.bundle import Bundle, loads
+from go1exp.deploy.runtime.bundle import loads
 from go1exp.deploy.runtime.launch import RobotError, SimulatedRobot
 from go1exp.deploy.runtime.loop import run as loop
 from go1exp.evaluate.bench.env import Measured
@@ -56,19 +56,14 @@ def run(container: dict[str, Any], much: Measured) -> dict[str, float]:
         file = place / "walk.zip"
         file.write_bytes(data)
         bundle = loads(data, str(file))
+        readings = {port.name: np.zeros((1, port.size), np.float32) for port in bundle.policy.inputs}
         for k in range(much.rounds):
             idle = loop(lambda now: True, RATE, much.seconds)
             jitter = {"idle_missed_400hz": 100.0 * idle.missed_share, "idle_period_p99_ms": 1e3 * idle.period_p99}
-            calls = {"policy_us": _policy(bundle), "packets_us": _packets()}
+            calls = {"policy_us": _median_us(lambda: bundle.policy(readings)), "packets_us": _packets()}
             results.append(_walk(file, much.seconds, place / str(k)) | calls | jitter)
             much.on_round(k + 1, much.rounds)
     return {name: float(np.median([one[name] for one in results])) for name in results[0]}
-
-
-def _policy(bundle: Bundle) -> float:
-    """Return the time of one call of the policy, us: the median."""
-    readings = {port.name: np.zeros((1, port.size), np.float32) for port in bundle.policy.inputs}
-    return _median_us(lambda: bundle.policy(readings))
 
 
 def _packets() -> float:

@@ -61,13 +61,11 @@ def names(run: Run) -> list[str]:
 def evaluations(study: Study) -> list[Evaluation]:
     """Return every evaluation that runs of a study have; exclusions are noted in the study."""
     known = Counter(name for run in study.runs for name in names(run))
-    old = [run.label for run in study.runs if (run.folder / FILE).is_file() and GRID not in names(run)]
-    if old:
+    if old := [run.label for run in study.runs if (run.folder / FILE).is_file() and GRID not in names(run)]:
         study.notes.append(f"{_listed(old)}: eval.json without eval.parquet; eval=true makes both")
     made = [_evaluation(name, study) for name in [GRID, *sorted(set(known) - {GRID})] if name in known]
     for evaluation in made:
-        missing = [run.label for run in study.runs if evaluation.name not in names(run)]
-        if missing:
+        if missing := [run.label for run in study.runs if evaluation.name not in names(run)]:
             how = "" if evaluation.name == GRID else f" protocol={evaluation.name}"
             study.notes.append(f"{evaluation.name}: no evaluation of {_listed(missing)}; eval=true{how} makes it")
     if not made:
@@ -114,8 +112,7 @@ def _evaluation(name: str, study: Study) -> Evaluation:
     usual = Counter(e.sign for e in entries.values()).most_common(1)[0][0]
     kept = {folder: e for folder, e in entries.items() if e.sign == usual}
     first = next(iter(kept.values()))
-    others = [run.label for run in study.runs if run.folder in entries and run.folder not in kept]
-    if others:
+    if others := [run.label for run in study.runs if run.folder in entries and run.folder not in kept]:
         one, other = first.settings, next(e.settings for e in entries.values() if e.sign != usual)
         differ = ", ".join(k for k in {**one, **other} if one.get(k) != other.get(k)) or "columns of the rows"
         study.notes.append(f"{name}: {_listed(others)} excluded, evaluated with other settings ({differ}) than most")

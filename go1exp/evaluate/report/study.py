@@ -193,8 +193,7 @@ def groups(study: Study) -> list[Group]:
         group.name = name
     sections = {key.partition(".")[0] for key in differing}
     study.notes += [text for section, text in COMPARABLE.items() if section in sections]
-    single = [g.name for g in made if len(g.runs) == 1]
-    if single:
+    if single := [g.name for g in made if len(g.runs) == 1]:
         listed = ", ".join(single[:4]) + (", ..." if len(single) > 4 else "")
         have = "has" if len(single) == 1 else "have"
         study.notes.append(

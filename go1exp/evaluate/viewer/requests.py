@@ -115,15 +115,11 @@ def catalogue(effects: tuple[Term, ...], randomize: bool) -> tuple[dict[str, Ter
     sizes = dict.fromkeys(known, 0.0)
     for term in effects:
         spread = randomize and any(term.slots.get("spread", {}).values())
-        if spread or _is_active(term):
+        nulls = {p.name: p.null for p in params_of(term)}
+        if spread or any(v != nulls[name] for name, value in term.parameters.items() for v in numbers(value)):
             known[term.key] = term if spread else dataclasses.replace(term, slots={"spread": {}})
             sizes[term.key] = 1.0
     return dict(sorted(known.items())), sizes
-
-
-def _is_active(term: Term) -> bool:
-    nulls = {p.name: p.null for p in params_of(term)}
-    return any(v != nulls[name] for name, value in term.parameters.items() for v in numbers(value))
 
 
 def active(
