@@ -57,7 +57,7 @@ def settings(**changes: Any) -> MpcSettings:
     return parsed
 
 
-BODY = (12.743, np.diag([0.127, 0.394, 0.423]))  # mass, kg, and inertia, kg m2
+MASS, INERTIA = 12.743, np.diag([0.127, 0.394, 0.423])  # kg, kg m2
 HIPS = np.column_stack([gait.HIPS, np.zeros(4)])
 
 
@@ -79,7 +79,7 @@ def problem(seed: int | None = None, steps: int = 10, slope: tuple[float, float]
 
 @pytest.fixture(scope="module")
 def plan() -> ForcePlan:
-    return ForcePlan(settings().force, *BODY)
+    return ForcePlan(settings().force, MASS, INERTIA)
 
 
 # ---------------------------------------------------------------------- forces
@@ -88,8 +88,8 @@ def plan() -> ForcePlan:
 def test_at_rest_the_forces_carry_the_weight_evenly(plan: ForcePlan) -> None:
     found = plan.solve(problem())
     assert found is not None
-    np.testing.assert_allclose(found[0].sum(0), [0.0, 0.0, BODY.mass * GRAVITY], atol=1e-6)
-    np.testing.assert_allclose(found[0, :, 2], BODY.mass * GRAVITY / 4, atol=1e-6)
+    np.testing.assert_allclose(found[0].sum(0), [0.0, 0.0, MASS * GRAVITY], atol=1e-6)
+    np.testing.assert_allclose(found[0, :, 2], MASS * GRAVITY / 4, atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -112,10 +112,10 @@ def test_forces_stay_in_the_friction_pyramid_of_the_ground(
 def rolled_out(asked: Problem, found: np.ndarray, dt: float) -> np.ndarray:
     """The states (K, 4, 3) under forces (K, 4, 3), step by step: what the programme predicts, the slow way."""
     state, after = asked.state.copy(), []
-    inverse = asked.attitude @ np.linalg.inv(BODY.inertia) @ asked.attitude.T
+    inverse = asked.attitude @ np.linalg.inv(INERTIA) @ asked.attitude.T
     for arms, each in zip(asked.arms, found, strict=True):
         turn = inverse @ np.cross(arms, each).sum(0)
-        push = each.sum(0) / BODY.mass - [0.0, 0.0, GRAVITY]
+        push = each.sum(0) / MASS - [0.0, 0.0, GRAVITY]
         state = state + dt * np.array([state[2], state[3], turn, push])
         state[0] += 0.5 * dt**2 * turn
         state[1] += 0.5 * dt**2 * push
@@ -129,7 +129,7 @@ def test_the_programme_is_the_cost_of_its_own_prediction(plan: ForcePlan, seed: 
     H, g, *_ = plan.programme(asked)
     w = plan.settings.weights
     weights = np.array([w.attitude, w.position, w.angular_velocity, w.velocity])
-    share = BODY.mass * GRAVITY / asked.stands.sum(1)[:, None] * asked.stands
+    share = MASS * GRAVITY / asked.stands.sum(1)[:, None] * asked.stands
 
     def cost(x: np.ndarray) -> float:
         found = np.zeros((*asked.stands.shape, 3))
@@ -147,7 +147,7 @@ def test_the_programme_is_the_cost_of_its_own_prediction(plan: ForcePlan, seed: 
 @pytest.mark.parametrize("seed", [3, 4])
 def test_the_solution_is_scipys(seed: int) -> None:
     small = dataclasses.replace(settings().force, steps=4, effort=1e-4)
-    plan, asked = ForcePlan(small, *BODY), problem(seed, steps=4)
+    plan, asked = ForcePlan(small, MASS, INERTIA), problem(seed, steps=4)
     H, g, A, upper, lower = plan.programme(asked)
     n = len(g)
     scale = 100.0  # of forces, N: for the search's sake
@@ -178,7 +178,7 @@ def test_a_missing_solver_is_one_line_that_names_the_extra(monkeypatch: pytest.M
 
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(forces.SolverError, match=r"^controller=mpc: needs daqp.*go1exp\[mpc\]'$"):
-        ForcePlan(settings().force, *BODY)
+        ForcePlan(settings().force, MASS, INERTIA)
 
 
 # ---------------------------------------------------------------------- gait, feet, ground, swing, kinematics
