@@ -253,9 +253,10 @@ def test_the_way_of_a_foot_begins_and_ends_at_rest_and_its_velocity_is_its_deriv
 
 def test_feet_stand_half_a_stance_behind_and_half_a_stance_ahead_of_the_hip() -> None:
     legs = np.arange(4)
-    placed = gait.footholds(settings().swing, np.array([1.0, 0.0, 0.0]), (1.0, 0.0, 0.0), np.full(4, 0.1), 0.2, legs)
+    gain = settings().swing.velocity_gain
+    placed = gait.footholds(gain, np.array([1.0, 0.0, 0.0]), (1.0, 0.0, 0.0), np.full(4, 0.1), 0.2, legs)
     np.testing.assert_allclose(placed, gait.HIPS + np.array([0.2, 0.0]))
-    turning = gait.footholds(settings().swing, np.zeros(3), (0.0, 0.0, 1.0), np.zeros(4), 0.2, legs)
+    turning = gait.footholds(gain, np.zeros(3), (0.0, 0.0, 1.0), np.zeros(4), 0.2, legs)
     np.testing.assert_allclose(turning - gait.HIPS, 0.1 * np.cross([0.0, 0.0, 1.0], HIPS)[:, :2], atol=1e-12)
 
 

@@ -90,16 +90,18 @@ HIPS = SIDES * [robot.HIP_OFFSET[0], robot.HIP_OFFSET[1] + robot.LINK_LENGTHS[0]
 ACROSS = HIPS[:, ::-1] * [-1.0, 1.0]  # (4, 2) velocities of these points at a yaw rate of 1 rad/s, m/s
 
 
-def footholds(gain: float, velocity: np.ndarray, command: Command, left: np.ndarray, legs: np.ndarray) -> np.ndarray:
+def footholds(
+    gain: float, velocity: np.ndarray, command: Command, left: np.ndarray, stance: float, legs: np.ndarray
+) -> np.ndarray:
     """Return footholds (n, 2) of ``legs`` (n,) from the trunk's origin, m; all in the axes of the robot's heading.
 
     Below the position of the hip in mid-stance (Raibert 1986), plus ``gain``, s, times the error of the trunk's
-    ``velocity`` (3,), m/s. ``left`` (n,) is the time until the middle of each stance, s.
+    ``velocity`` (3,), m/s. ``left`` (n,) is the time until each touch-down, ``stance`` the duration of the stance, s.
     """
     vx, vy, _ = velocity.tolist()
     x, y, yaw = command
     moving = yaw * ACROSS[legs] + [vx, vy]
-    return np.asarray(HIPS[legs] + moving * left[:, None] + gain * np.array([vx - x, vy - y]))
+    return np.asarray(HIPS[legs] + moving * (left + 0.5 * stance)[:, None] + gain * np.array([vx - x, vy - y]))
 
 
 def way(

@@ -217,8 +217,8 @@ class Mpc:
         duration = (1.0 - clock.duty) * clock.period
         share = clock.swing_share()[legs]
         share[share < 0.0] = 1.0  # overdue: the swing has ended
-        left = (1.0 - share) * duration + 0.5 * (clock.duty * clock.period)
-        below = footholds(swing.velocity_gain, self._ahead, command, left, legs)
+        left, stance = (1.0 - share) * duration, clock.duty * clock.period
+        below = footholds(swing.velocity_gain, self._ahead, command, left, stance, legs)
         end = np.empty((len(legs), 3))
         end[:, :2] = below
         end[:, 2] = below @ self._slope() + (robot.FOOT_RADIUS - swing.depth - self._ground.height)
