@@ -80,8 +80,8 @@ def evaluated(claims: Mapping[str, Claim], summary: Sequence[Mapping[str, Any]])
         for entry in summary:
             figure = entry["figures"].get(claim.quantity)
             if figure is not None and all(entry["condition"].get(k) == v for k, v in claim.where.items()):
-                numbers = (math.nan if figure[k] is None else float(figure[k]) for k in ("estimate", "low", "high"))
-                interval = Interval(*numbers, figure["n"])
+                known = {k: math.nan if figure[k] is None else float(figure[k]) for k in ("estimate", "low", "high")}
+                interval = Interval(known["estimate"], known["low"], known["high"], figure["n"])
                 candidates.append(Verdict(name, verdict(interval, claim), claim, interval, entry["condition"], 0))
         nothing = Verdict(name, "inconclusive", claim, Interval(math.nan, math.nan, math.nan, 0), claim.where, 0)
         worst = min(candidates, key=_rank, default=nothing)
