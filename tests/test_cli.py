@@ -451,13 +451,6 @@ def test_cfg_job_prints_the_configuration_and_runs_nothing(tmp_path: Path) -> No
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_version_is_that_of_the_package(tmp_path: Path) -> None:
-    pyproject = (data_root() / "pyproject.toml").read_text()
-    version = re.search(r'^version = "(.+)"$', pyproject, re.MULTILINE)
-    assert version
-    assert refuse(tmp_path, "--version").stdout == f"go1exp {version.group(1)}\n"
-
-
 @pytest.mark.parametrize("given", [None, "3"])
 def test_blas_has_one_thread_unless_the_user_says_otherwise(given: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Set before NumPy is imported, which the general help shows not to be."""

@@ -72,14 +72,13 @@ def test_a_robot_that_stands_feels_its_weight() -> None:
 
 
 def test_a_soft_ground_lets_feet_sink() -> None:
-    still = np.tile(robot.NOMINAL_STANCE, (100, 1))[:, None]
     heights = []
     for ground in (Ground(), Ground(time_constant=0.1)):
         model = build(Truth(), ground, 5e-4)
         data = mujoco.MjData(model)
-        data.qpos[:] = [0.0, 0.0, robot.NOMINAL_HEIGHT, 1.0, 0.0, 0.0, 0.0, *still[0, 0]]
-        for _ in range(4000):
-            data.ctrl[:] = 80.0 * (still[0, 0] - data.qpos[7:]) - 2.0 * data.qvel[6:]
+        data.qpos[:] = [0.0, 0.0, robot.NOMINAL_HEIGHT, 1.0, 0.0, 0.0, 0.0, *robot.NOMINAL_STANCE]
+        for _ in range(1000):
+            data.ctrl[:] = 80.0 * (robot.NOMINAL_STANCE - data.qpos[7:]) - 2.0 * data.qvel[6:]
             mujoco.mj_step(model, data)
         heights.append(min(data.geom(f"{leg}_foot").xpos[2] for leg in robot.LEGS))
     assert heights[1] < heights[0] - 0.005
@@ -109,16 +108,13 @@ def test_first_poses_and_noise_are_those_of_the_seed() -> None:
     """Whatever the robot and the policy: the first readings of all are the same but for what the robot hides."""
     first: list[Mapping[str, np.ndarray]] = []
 
-    def listening(readings: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        first.append(readings)
-        return held(readings)
+    for policy in (held, folded):
 
-    def other(readings: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        first.append(readings)
-        return folded(readings)
+        def listening(readings: Mapping[str, np.ndarray], policy: Any = policy) -> Any:
+            first.append(readings)
+            return policy(readings)
 
-    for policy in (listening, other):
-        walk(Truth(), Ground(), policy, np.zeros((3, 3)), 0.04, 5e-4, np.random.default_rng([7, 3]), NONE)
+        walk(Truth(), Ground(), listening, np.zeros((3, 3)), 0.04, 5e-4, np.random.default_rng([7, 3]), NONE)
     for name, values in first[0].items():
         np.testing.assert_array_equal(values, first[2][name])
     assert abs(first[1]["joint_pos"] - first[3]["joint_pos"]).max() > 0.01

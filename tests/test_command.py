@@ -82,11 +82,6 @@ def test_an_error_in_a_fork_is_a_traceback_and_a_signal_its_status(tmp_path: Pat
         assert run(tmp_path, code=code, preload=LIGHT).returncode == -getattr(signal, name)
 
 
-def test_a_fork_leaves_nothing_to_the_next(tmp_path: Path) -> None:
-    code = "import os, sys; print(hasattr(sys, 'mark'), os.environ.get('MARK')); sys.mark = 1; os.environ['MARK'] = '1'"
-    assert [run(tmp_path, code=code, preload=LIGHT).stdout for _ in range(2)] == ["False None\n"] * 2
-
-
 def test_a_fork_that_hangs_is_given_up(tmp_path: Path) -> None:
     begin = time.monotonic()
     with pytest.raises(subprocess.TimeoutExpired):

@@ -595,15 +595,6 @@ def test_foot_height_over_rough_ground_is_the_height_over_the_field(start_core: 
     assert np.ptp(heights) > 0.1
 
 
-def test_a_foot_that_stands_is_its_radius_above_the_ground(start_core: Make) -> None:
-    for ground in ((), (*TILES, "terrain.ramp_slope=[0.2,0.2]")):
-        core = start_core(*QUIET, *ground, num_envs=3, noise=False)
-        list(run(core, torch.zeros(60, 3, 12)))
-        s = core.snapshot()
-        assert s.foot_contact.all()
-        np.testing.assert_allclose(s.foot_height, robot.FOOT_RADIUS, atol=3e-3)
-
-
 def test_a_robot_that_leaves_the_map_is_truncated_and_brought_back(start_core: Make) -> None:
     core = start_core(*QUIET, *TILES, num_envs=6, noise=False)
     spawn = core.backend.qpos[:, :3].clone()

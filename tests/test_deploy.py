@@ -44,7 +44,7 @@ from go1exp.deploy.runtime.controller import LYING, PHASES, STANCE_ERROR, Cycle
 from go1exp.deploy.runtime.estimate import BLIND_S, KalmanEstimator, settings
 from go1exp.deploy.runtime.job import Job, run_job
 from go1exp.deploy.runtime.launch import RefusedError, RobotError
-from go1exp.deploy.runtime.log import About, Log, Ring
+from go1exp.deploy.runtime.log import About, Log
 from go1exp.deploy.runtime.report import DONE
 from go1exp.deploy.runtime.safety import RULES
 from go1exp.deploy.runtime.walk import FAULTS, STATUS, Plan
@@ -725,16 +725,6 @@ def test_a_word_of_the_command_line_is_numbers_or_a_name() -> None:
 
 
 # ---------------------------------------------------------------------- the log
-
-
-def test_a_ring_keeps_the_newest_rows() -> None:
-    ring = Ring((("a", 1), ("b", 2)), 4)
-    for k in range(6):
-        row = ring.next()
-        row[0], row[1:] = k, (10 * k, 20 * k)
-    assert ring.part("a").tolist() == [2.0, 3.0, 4.0, 5.0]
-    assert ring.part("b")[-1].tolist() == [50.0, 100.0]
-    assert ring.overwritten == 2
 
 
 def cycle(t: float, phase: str, fresh: list[LowState], target: float | None = 0.0) -> Cycle:

@@ -320,13 +320,6 @@ def test_feet_sink_with_the_square_of_the_time_constant() -> None:
     assert np.allclose(deep / shallow, 4.0, rtol=0.1)
 
 
-def test_the_models_own_time_constants_are_the_null_values() -> None:
-    model = rig({}).backend.model
-    feet = [model.geom(f"{leg}_foot").id for leg in robot.LEGS]
-    assert (model.geom_solref[feet, 0] == 0.02).all()
-    assert (model.jnt_solref[:, 0] == 0.02).all()
-
-
 def test_a_restitution_that_is_randomised_acts_on_soft_ground_too() -> None:
     from go1exp.mdp.randomizations import foot_restitution
 

@@ -26,7 +26,6 @@ from go1exp.config.schema.registry import Term, bind
 from go1exp.deploy.runtime import go1_wire
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.robot.messages import LowCmd
-from go1exp.sim.actuator.motors import envelope
 from go1exp.sim.effects.base import Effect
 from go1exp.sim.env.plant import Plant, actuator_setup
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu
@@ -585,48 +584,3 @@ def test_a_swing_without_a_drive_loses_what_the_loaded_gears_take() -> None:
     assert abs(expected + 2.6) > 0.1
     assert abs(float(free.q[0, CALF]) - expected) > 0.05
     assert found[-1] == pytest.approx(expected, abs=1e-3)
-
-
-def test_lag_answers_a_step_with_an_exponential(drives: Callable[..., ActuatorSetup]) -> None:
-    effect = term("effect", "lag", {"time": 0.01})(drives(1))
-    demand = torch.ones(30, 1, 12, dtype=torch.float64)
-    demand[0] = 0.0
-    found = drive(effect, demand)[:, 0, 0].numpy()
-    t = DT * (np.arange(1, 30) - 0.5)  # a step between two samples is a ramp about their middle
-    np.testing.assert_allclose(found[1:], 1.0 - np.exp(-t / 0.01), atol=(DT / 0.01) ** 2 / 24)
-    np.testing.assert_allclose((1 - found[2:]) / (1 - found[1:-1]), math.exp(-DT / 0.01), rtol=1e-10)
-
-
-def test_lag_and_delay_of_a_ramp_are_the_ramp_of_a_while_ago(drives: Callable[..., ActuatorSetup]) -> None:
-    ramp = (3.0 * DT * torch.arange(200, dtype=torch.float64)).reshape(-1, 1, 1).expand(-1, 1, 12)
-    for name, values in (("lag", {"time": 0.007}), ("torque_delay", {"delay": 0.007})):
-        found = drive(term("effect", name, values)(drives(1)), ramp)
-        np.testing.assert_allclose(found[100:, 0], ramp[100:, 0] - 3.0 * 0.007, atol=1e-7)
-
-
-def test_the_torque_speed_line_of_a_go1() -> None:
-    """The table of the Go1's facts: Isaac Lab's DC motor with 23.7 N m and 30 rad/s."""
-    qd = torch.tensor([0.0, 10.0, 15.0, 20.0, 30.0, 45.0, 60.0, 75.0], dtype=torch.float64)
-    motor = [torch.tensor(x, dtype=torch.float64) for x in (23.7, 23.7, 30.0)]
-    low, high = envelope(qd, *motor)
-    assert high.tolist() == pytest.approx([23.7, 15.8, 11.85, 7.9, 0.0, -11.85, -23.7, -23.7], abs=1e-12)
-    assert low.tolist() == pytest.approx([-23.7] * 8)
-    mirrored = envelope(-qd, *motor)
-    assert torch.equal(mirrored[0], -high)
-    assert torch.equal(mirrored[1], -low)
-    corner = envelope(qd, motor[0], motor[0] * 30.0 / 23.7, motor[2])[1]  # the line begins at 6.3 rad/s
-    assert corner.tolist()[:5] == pytest.approx([23.7, 20.0, 15.0, 10.0, 0.0])
-    flat = envelope(qd, motor[0], motor[1], torch.tensor(math.inf, dtype=torch.float64))
-    assert flat[1].tolist() == [23.7] * 8
-
-
-def test_torque_speed_limit_is_that_line(drives: Callable[..., ActuatorSetup]) -> None:
-    """Droop 1 with the vendor's 30.1 rad/s; a battery down by a fifth moves the line down and in."""
-    setup = drives(2)
-    full = torch.full((2, 12), 50.0, dtype=torch.float64)
-    for share in (1.0, 0.8):
-        effect = term("effect", "torque_speed_limit", {"peak": share, "droop": 1.0 / share})(setup)
-        for qd in (0.0, 8.0, 16.0, 24.0):
-            expected = (share - qd / setup.velocity_limit) * setup.effort_limit
-            found = effect.on_actuator(full, full, torch.full_like(full, qd))
-            assert torch.allclose(found, torch.maximum(expected, -share * setup.effort_limit).expand(2, 12))

@@ -135,12 +135,6 @@ def test_choices_of_ones_own_that_are_no_yaml_or_lead_back_are_refused_by_file(t
         assert done.stderr.count("\n") == 1
 
 
-def test_make_raises_errors_of_go1exp() -> None:
-    for override in ("reward=papr", "rand=tabel1", "terrain=ruff", "event=psh"):
-        with pytest.raises(ConfigError, match=f"{override}: unknown choice"):
-            go1exp.make([override])
-
-
 @pytest.mark.parametrize(
     ("script", "status", "said"),
     [

@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
-import os
-import subprocess
 import sys
 import zipfile
 from collections.abc import Callable
@@ -44,6 +42,7 @@ from go1exp.sim.task import ActionConfig, TaskConfig, parse_task, parse_train
 from go1exp.train import run_folder
 from go1exp.train.policy import load_policy
 from go1exp.train.ppo import GaussianPolicy
+from tests.command import run_alone
 from tests.small_run import trained
 
 OBSERVATIONS = sorted(p.stem for p in (data_root() / "conf/observation").glob("*.yaml"))
@@ -380,10 +379,9 @@ def test_another_policy_is_refused_by_the_replay(members: dict[str, bytes]) -> N
 
 
 def test_a_graph_that_is_none_or_another_is_refused(members: dict[str, bytes]) -> None:
-    assert refused(pack({**members, "policy.onnx": b"nonsense"})).startswith(
-        "policy.onnx: not a graph that onnxruntime"
-    )
-    assert refused(pack({**members, "policy.onnx": b""})).startswith("policy.onnx: not a graph that onnxruntime")
+    for content in (b"nonsense", b""):
+        said = refused(pack({**members, "policy.onnx": content}))
+        assert said.startswith("policy.onnx: not a graph that onnxruntime")
     for what, name in (("input", "joint_pos"), ("output", "action")):
         model = onnx.load_from_string(members["policy.onnx"])
         for value in getattr(model.graph, what):
@@ -517,16 +515,8 @@ def test_the_runtime_does_on_the_traces_readings_what_the_environment_did(good: 
     estimator = SimpleNamespace(update=lambda state: None, ahead=lambda age: trace["input.base_lin_vel_b"][len(sent)])
     safety = Safety(robot.JOINTS, robot.JOINT_POS_LIMITS, np.array(good.metadata.torque_limit))
     gains: dict[str, Any] = {"kp": np.array(good.metadata.kp), "kd": np.array(good.metadata.kd)}
-    runtime = Controller(
-        good,
-        cast(Link, link),
-        commands,
-        estimator,
-        safety,
-        stages=Stages(stand_up=0.0),
-        on_cycle=observed.append,
-        **gains,
-    )
+    about: dict[str, Any] = {"stages": Stages(stand_up=0.0), "on_cycle": observed.append, **gains}
+    runtime = Controller(good, cast(Link, link), commands, estimator, safety, **about)
     for state in states:
         assert runtime.cycle(state.t)
     assert safety.fault is None
@@ -543,14 +533,7 @@ def test_loading_a_bundle_loads_neither_torch_nor_an_engine_nor_hydra(data: byte
         "from go1exp.deploy.runtime.bundle import load; found = load('b.zip'); "
         "print(json.dumps([found.seal, sorted({name.split('.')[0] for name in sys.modules})]))"
     )
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(data_root())},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    done = run_alone(tmp_path, code=code, PYTHONWARNINGS="error")
     assert done.returncode == 0, done.stderr
     sealed, modules = json.loads(done.stdout)
     assert sealed == seal(data)
@@ -575,9 +558,7 @@ def test_export_writes_a_bundle_and_check_says_what_is_in_it(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(
-        "go1exp.deploy.export.build.to_onnx", lambda module: members["policy.onnx"]
-    )  # of this run: 3 s less
+    monkeypatch.setattr("go1exp.deploy.export.build.to_onnx", lambda module: members["policy.onnx"])  # 3 s less
     assert verb(monkeypatch, "export", f"run={run}", "seconds=0.5", "out=there/walk.zip", "checkpoint=000002.pt") == 0
     message = capsys.readouterr().out
     assert [p.name for p in (tmp_path / "there").iterdir()] == ["walk.zip"]

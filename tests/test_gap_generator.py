@@ -226,23 +226,6 @@ def test_a_held_weight_hangs_where_gravity_says() -> None:
     np.testing.assert_allclose(35.0 * (robot.NOMINAL_STANCE - end), 1.2 * data.qfrc_bias, atol=2e-3)
 
 
-def test_the_encoder_reads_its_offset() -> None:
-    truth, offset = Truth(), np.linspace(-0.02, 0.02, 12)
-    apply(truth, "encoder_offset", {"offset": offset}, EVERY)
-    a, b = (run(t, hold(0.5, kp=2000.0, kd=20.0)).q[-1, 0] for t in (truth, Truth()))
-    np.testing.assert_allclose(a, b, atol=2e-4)  # the drive makes its reading the target
-
-
-def test_a_command_delay_shifts_the_answer_in_time() -> None:
-    target = np.tile(robot.NOMINAL_STANCE, (300, 1))
-    target += 0.1 * np.sin(np.arange(300) / 300 * 4 * np.pi)[:, None]
-    late = Truth()
-    apply(late, "command_delay", {"delay": np.full(12, 0.01)}, EVERY)
-    a, b = (run(t, hold(0.6, target=target)).q[:, 0] for t in (late, Truth()))
-    np.testing.assert_allclose(a[105:], b[100:-5], atol=3e-5)  # 10 ms are five rows
-    assert np.abs(a[105:] - b[105:]).max() > 5e-3
-
-
 @pytest.mark.slow("benchmarks/", "go1exp/sim/effects/")
 @pytest.mark.parametrize("effect", cases.SUSPENDED)
 @pytest.mark.usefixtures("brief")

@@ -152,18 +152,23 @@ def test_the_table_agrees_with_what_the_learner_reports(tmp_path: Path, monkeypa
 # ---------------------------------------------------------------------- TensorBoard
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_tensorboard_reads_back_what_was_logged(tmp_path: Path) -> None:
+def events_of(run: Path) -> Any:
+    """Read what was logged for TensorBoard."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+    events = EventAccumulator(str(run / "tensorboard"))
+    return events.Reload()
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_tensorboard_reads_back_what_was_logged(tmp_path: Path) -> None:
     logger = make_logger(LoggerConfig(csv=False, tensorboard=True, wandb=None), tmp_path, 0, {})
     for iteration in (1, 2, 3):
         logger.record("train/kl", 0.25 * iteration)
         logger.record("reward/gait", -1.5)
         logger.dump(step=64 * iteration)
     logger.close()
-    events = EventAccumulator(str(tmp_path / "tensorboard"))
-    events.Reload()
+    events = events_of(tmp_path)
     assert set(events.Tags()["scalars"]) == {"train/kl", "reward/gait"}
     assert [(e.step, e.value) for e in events.Scalars("train/kl")] == [(64, 0.25), (128, 0.5), (192, 0.75)]
     assert [e.value for e in events.Scalars("reward/gait")] == [-1.5] * 3
@@ -172,8 +177,6 @@ def test_tensorboard_reads_back_what_was_logged(tmp_path: Path) -> None:
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_tensorboard_hides_the_rows_beyond_the_checkpoint_that_a_run_went_on_from(tmp_path: Path) -> None:
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
     config = LoggerConfig(csv=False, tensorboard=True, wandb=None)
     for first, last, value in ((1, 3, 0.25), (3, 4, 0.5)):
         logger = make_logger(config, tmp_path, first - 1, {}, steps=64 * (first - 1))
@@ -181,8 +184,7 @@ def test_tensorboard_hides_the_rows_beyond_the_checkpoint_that_a_run_went_on_fro
             logger.record("train/kl", value)
             logger.dump(step=64 * iteration)
         logger.close()
-    events = EventAccumulator(str(tmp_path / "tensorboard"))
-    events.Reload()
+    events = events_of(tmp_path)
     assert [(e.step, e.value) for e in events.Scalars("train/kl")] == [(64, 0.25), (128, 0.25), (192, 0.5), (256, 0.5)]
 
 
@@ -385,15 +387,13 @@ def test_without_a_bundle_there_is_a_line_that_says_why(tmp_path: Path, capsys: 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_tensorboard_has_the_configuration_as_hyperparameters(tmp_path: Path) -> None:
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
     from tensorboard.plugins.hparams import plugin_data_pb2
 
     settings = {"seed": 7, "reward": {"gait": {"weight": 10.0}}, "resume": None, "devices": [1, 2]}
     config = LoggerConfig(csv=False, tensorboard=True, wandb=None)
     make_logger(config, tmp_path, 0, settings).close()
     make_logger(config, tmp_path, 1, settings, steps=64).close()
-    events = EventAccumulator(str(tmp_path / "tensorboard"))
-    events.Reload()
+    events = events_of(tmp_path)
     content = events.summary_metadata["_hparams_/session_start_info"].plugin_data.content
     found = plugin_data_pb2.HParamsPluginData.FromString(content).session_start_info.hparams
     assert found["reward.gait.weight"].number_value == 10.0

@@ -23,6 +23,7 @@ from go1exp.config.schema.physics import ContactConfig
 from go1exp.logs import recording as rec
 from go1exp.logs.recording import Meta, Recording, RecordingError
 from go1exp.robot import JOINTS, LEGS
+from tests.command import run_alone
 from tests.made import meta
 
 META = meta(
@@ -412,12 +413,9 @@ def test_a_quaternion_rounded_to_three_decimals_and_a_jittering_clock_with_gaps_
 
 
 def test_importing_the_format_loads_no_engine() -> None:
-    import subprocess
-    import sys
-
     code = (
         "import sys, go1exp.logs.recording; "
         "print([m for m in ('torch', 'mujoco', 'hydra', 'gymnasium', 'pyarrow', 'scipy') if m in sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    done = run_alone(Path.cwd(), code=code)
     assert done.stdout.strip() == "[]", done.stderr

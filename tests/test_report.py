@@ -431,11 +431,6 @@ def test_two_sweeps_of_one_name_keep_their_runs_apart_and_count_each_seed_once(t
     assert len(again.groups[0].runs) == 2
 
 
-def test_a_figure_that_is_not_there_is_refused_with_the_nearest(two_groups: Path) -> None:
-    with pytest.raises(ConfigError, match=r"figures.*error_yow.*did you mean 'error_yaw'"):
-        made(two_groups, figures=("error_yow",))
-
-
 def test_figures_are_refused_before_anything_is_evaluated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run(tmp_path / "a", 0, evaluated=False)
     (tmp_path / "a/checkpoints").mkdir()

@@ -82,12 +82,12 @@ def snapshot(n: int = 1, **changes: Any) -> Snapshot:
     return Snapshot(**tensors)
 
 
-def with_joints(**angles: float) -> list[float]:
-    """Joint vector of the nominal stance with some joints moved, rad."""
+def with_joints(**angles: float) -> dict[str, Any]:
+    """The nominal stance with some joints moved, rad."""
     q = list(robot.NOMINAL_STANCE)
     for joint, angle in angles.items():
         q[robot.JOINTS.index(joint)] = angle
-    return q
+    return {"joint_pos": q}
 
 
 def feet(**values: Any) -> list[Any]:
@@ -118,90 +118,59 @@ PACE_PHASE = {"foot_air_time": feet(FR=0.1, RR=0.1), "foot_contact_time": feet(F
 BOUND_PHASE = {"foot_air_time": feet(FR=0.1, FL=0.1), "foot_contact_time": feet(RR=0.1, RL=0.1)}
 PRONK_PHASE = {"foot_air_time": [0.1] * 4, "foot_contact_time": [0.0] * 4}
 LANDING = {"foot_touchdown_speed": [1.5, 2.0, 0.5, 9.0], "foot_touchdown": [True, False, True, False]}
-QUARTER = {"command": WALK, "episode_time": 0.1}
+QUARTER, THIRD = {"command": WALK, "episode_time": 0.1}, {"command": WALK, "episode_time": 0.3}
 APART = {"foot_air_time": [0.0, 1.0, 2.0, 3.0], "foot_contact_time": [10.0, 20.0, 30.0, 40.0]}
 SLIDING = {
     "foot_vel_w": feet(FR=[3.0, -4.0, 9.0], FL=[0.0, 1.0, 9.0], RR=[0.5, 0.0, -9.0]),
     "foot_contact": [True, False, True, True],
 }
+ON_THREE = {"foot_contact_time": [1.0, 0.0, 1.0, 1.0]}
+STEPPING = {"command": WALK, "foot_air_time": feet(FR=0.1, RL=0.3), "foot_contact_time": feet(FL=0.05, RR=0.25)}
+TWO_LAND = {"foot_last_air_time": [0.3, 0.1, 0.5, 0.0], "foot_touchdown": [True, True, False, False], "command": WALK}
+METRE_OFF = {"command": [1.0, 0.0, 1.0], "base_lin_vel_b": [0.4, 0.8, 0.0]}
 TENTH_OFF = [q + 0.1 for q in robot.NOMINAL_STANCE]
+DRIFTING, SLOW = (
+    {"joint_pos": TENTH_OFF, "base_lin_vel_b": [0.9, 0, 0]},
+    {"standing_scale": 2.0, "speed_threshold": 1.0},
+)
+HIGH_FEET = {"foot_vel_w": feet(FR=[20.0, 0, 0], RL=[0, 20.0, 0]), "foot_height": [0.2] * 4}
+WIDE = {"target_height": 0.1, "scale": 0.1, "speed_scale": 1.0}
+HEAVING = {"base_lin_vel_b": [3.0, 3.0, -0.5], "base_ang_vel_b": [1.0, -2.0, 5.0]}
+OUTSIDE = with_joints(
+    FR_hip=0.8199, RL_hip=-0.8199, FL_thigh=-0.5564, RR_thigh=4.3714, RR_calf=-2.7698, RL_calf=-0.9362
+)
+INSIDE = with_joints(FR_hip=0.8198, RL_hip=-0.8198, FL_thigh=-0.5563, RR_thigh=4.3713, RR_calf=-2.7697, RL_calf=-0.9363)
+"""Of 95 % of the ranges: hip +-0.81985, thigh -0.556325..4.371325, calf -2.76975..-0.93625."""
+BEYOND = with_joints(FR_hip=0.862, RL_hip=-0.864, FL_calf=-2.819)
+ONE_ABOVE = with_joints(FR_hip=0.8631, FL_hip=-0.8631, RR_hip=0.8629, RL_calf=-2.82)
 FAST = {"joint_vel": [30.2, 30.0, 20.1, -30.2, -30.0, -20.1, 30.05, 30.2, 20.0, 0.0, -30.2, -20.0]}
 """Above 30.1, 30.1 and 20.06 rad/s: FR hip and calf and RR thigh forwards, FL hip and calf and RL thigh backwards."""
 
 CASES = [
     # 4 x 0.175: standing, long contact is cut at mode_time.
     Case("feet_air_time", "standing on all feet", {}, 0.7),
-    Case(
-        "feet_air_time",
-        "standing with a foot lifted for 0.1 s",  # 3 x 0.175 - 0.1
-        {"foot_air_time": feet(FL=0.1), "foot_contact_time": [1.0, 0.0, 1.0, 1.0]},
-        0.425,
-    ),
-    Case(
-        "feet_air_time",
-        "standing with a foot lifted for long",  # 3 x 0.175 - 0.175
-        {"foot_air_time": feet(FL=0.3), "foot_contact_time": [1.0, 0.0, 1.0, 1.0]},
-        0.35,
-    ),
-    Case(
-        "feet_air_time",
-        "moving: only phases shorter than mode_time pay",  # 0.1 + 0.05
-        {"command": WALK, "foot_air_time": feet(FR=0.1, RL=0.3), "foot_contact_time": feet(FL=0.05, RR=0.25)},
-        0.15,
-    ),
-    Case(
-        "feet_air_time",
-        "moving: another mode_time",  # 0.1 + 0.3 + 0.05 + 0.25
-        {"command": WALK, "foot_air_time": feet(FR=0.1, RL=0.3), "foot_contact_time": feet(FL=0.05, RR=0.25)},
-        0.7,
-        {"mode_time": 0.31},
-    ),
+    # 3 x 0.175 - 0.1, and - 0.175
+    Case("feet_air_time", "standing with a foot lifted for 0.1 s", {**ON_THREE, "foot_air_time": feet(FL=0.1)}, 0.425),
+    Case("feet_air_time", "standing with a foot lifted for long", {**ON_THREE, "foot_air_time": feet(FL=0.3)}, 0.35),
+    # 0.1 + 0.05, and 0.1 + 0.3 + 0.05 + 0.25
+    Case("feet_air_time", "moving: only phases shorter than mode_time pay", STEPPING, 0.15),
+    Case("feet_air_time", "moving: another mode_time", STEPPING, 0.7, {"mode_time": 0.31}),
     Case("feet_air_time", "told to turn is moving", {"command": [0.0, 0.0, -0.01]}, 0.0),
     Case("feet_air_time", "drifting at 0.57 m/s is moving", {"base_lin_vel_b": [0.4, -0.4, 0.0]}, 0.0),
     Case("feet_air_time", "drifting at 0.42 m/s is standing", {"base_lin_vel_b": [0.3, -0.3, 0.0]}, 0.7),
     Case("feet_air_time", "falling is not moving", {"base_lin_vel_b": [0.0, 0.0, -2.0]}, 0.7),
-    Case(
-        "feet_air_time", "another speed threshold", {"base_lin_vel_b": [0.3, -0.3, 0.0]}, 0.0, {"speed_threshold": 0.4}
-    ),
-    Case(
-        "feet_air_time_touchdown",
-        "two feet land after 0.3 and 0.1 s",  # 0.125 - 0.075; the others do not land
-        {"command": WALK, "foot_last_air_time": [0.3, 0.1, 0.5, 0.0], "foot_touchdown": [True, True, False, False]},
-        0.05,
-    ),
-    Case(
-        "feet_air_time_touchdown",
-        "another threshold",
-        {"command": WALK, "foot_last_air_time": [0.3, 0.1, 0.5, 0.0], "foot_touchdown": [True, True, False, False]},
-        0.2,
-        {"threshold": 0.1},
-    ),
-    Case(
-        "feet_air_time_touchdown",
-        "nothing without a commanded velocity",
-        {"command": [0.0, 0.0, 1.0], "foot_last_air_time": [0.3] * 4, "foot_touchdown": [True] * 4},
-        0.0,
-    ),
+    Case("feet_air_time", "another threshold", {"base_lin_vel_b": [0.3, -0.3, 0.0]}, 0.0, {"speed_threshold": 0.4}),
+    # 0.125 - 0.075; the others do not land
+    Case("feet_air_time_touchdown", "two feet land after 0.3 and 0.1 s", TWO_LAND, 0.05),
+    Case("feet_air_time_touchdown", "another threshold", TWO_LAND, 0.2, {"threshold": 0.1}),
+    Case("feet_air_time_touchdown", "nothing without a velocity", {**TWO_LAND, "command": [0.0, 0.0, 1.0]}, 0.0),
     Case("linear_velocity_error", "no error", {"command": WALK, "base_lin_vel_b": [0.5, 0.0, 0.7]}, 1.0),
-    Case(
-        "linear_velocity_error",
-        "an error of 0.6 and 0.8 m/s",  # exp(-1)
-        {"command": [1.0, 0.0, 1.0], "base_lin_vel_b": [0.4, 0.8, 0.0]},
-        0.36787944,
-    ),
-    Case(
-        "linear_velocity_error",
-        "the same error on another scale",  # exp(-1/2)
-        {"command": [1.0, 0.0, 1.0], "base_lin_vel_b": [0.4, 0.8, 0.0]},
-        0.60653066,
-        {"scale": 2.0},
-    ),
+    Case("linear_velocity_error", "an error of 0.6 and 0.8 m/s", METRE_OFF, 0.36787944),  # exp(-1)
+    Case("linear_velocity_error", "another scale", METRE_OFF, 0.60653066, {"scale": 2.0}),  # exp(-1/2)
     Case("angular_velocity_error", "no error", {"command": [0, 0, 0.7], "base_ang_vel_b": [3.0, 3.0, 0.7]}, 1.0),
+    # exp(-2/2)
     Case(
-        "angular_velocity_error",
-        "turning the wrong way by 2 rad/s",  # exp(-2/2)
-        {"command": [0.0, 0.0, 1.0], "base_ang_vel_b": [0.0, 0.0, -1.0]},
-        0.36787944,
+        "angular_velocity_error", "wrong by 2 rad/s", {"command": [0, 0, 1], "base_ang_vel_b": [0, 0, -1]}, 0.36787944
     ),
     Case("gait", "a perfect trot", {"command": WALK, **TROT_PHASE}, 1.0),
     # Pace, bound and pronk: eight of the twelve squared differences are 0.1^2; exp(-0.08 / 0.1).
@@ -228,9 +197,7 @@ CASES = [
     Case("foot_clock", "standing feet, at worst", QUARTER, -1.0),
     Case("foot_clock", "two half as high, one too high", {**QUARTER, "foot_height": [0.053, 0.9, 0.023, 0.053]}, -1.0),
     Case("foot_clock", "an eighth: half of the height", {**QUARTER, "episode_time": 0.05}, 0.0),
-    Case(
-        "foot_clock", "the other swing", {**QUARTER, "episode_time": 0.3, "foot_height": feet(FL=0.083, RR=0.083)}, 1.0
-    ),
+    Case("foot_clock", "the other swing", {**THIRD, "foot_height": feet(FL=0.083, RR=0.083)}, 1.0),
     Case("foot_clock", "another rate", QUARTER, 0.0, {"rate": 1.25, "height": 0.1}),
     # Two feet 0.06 of 0.12 m up: each half a height off.
     Case("foot_clock", "half as high", {**QUARTER, "foot_height": [0.083, 0.023, 0.023, 0.083]}, 0.0, {"height": 0.12}),
@@ -251,51 +218,22 @@ CASES = [
     Case("diagonal_load", "a fall through the air", {**QUARTER, "foot_force": [0.0] * 4}, 0.0),
     Case("diagonal_load", "no command", {"command": [0.0] * 3, "foot_force": feet(FL=60.0)}, 0.0),
     Case("foot_clearance", "standing", {}, 1.0),
-    Case(
-        "foot_clearance",
-        "a foot that slides at 1 m/s",  # exp(-0.057^2 tanh(2) / 0.005)
-        {"foot_vel_w": feet(RR=[0.6, -0.8, 0.0])},
-        0.53449916,
-    ),
+    # exp(-0.057^2 tanh(2) / 0.005)
+    Case("foot_clearance", "a foot that slides at 1 m/s", {"foot_vel_w": feet(RR=[0.6, -0.8, 0.0])}, 0.53449916),
     Case("foot_clearance", "a foot that is lifted straight up", {"foot_vel_w": feet(RR=[0.0, 0.0, 1.0])}, 1.0),
-    Case(
-        "foot_clearance",
-        "feet that swing at the right height",
-        {"foot_vel_w": [[2.0, 0.0, 0.0]] * 4, "foot_height": [0.08] * 4},
-        1.0,
-    ),
-    Case(
-        "foot_clearance",
-        "two feet 0.1 m too high at full speed, other parameters",  # exp(-2 x 0.01 / 0.1)
-        {"foot_vel_w": feet(FR=[20.0, 0, 0], RL=[0, 20.0, 0]), "foot_height": [0.2] * 4},
-        0.81873075,
-        {"target_height": 0.1, "scale": 0.1, "speed_scale": 1.0},
-    ),
+    Case("foot_clearance", "right height", {"foot_vel_w": [[2.0, 0.0, 0.0]] * 4, "foot_height": [0.08] * 4}, 1.0),
+    # Two feet 0.1 m too high at full speed: exp(-2 x 0.01 / 0.1).
+    Case("foot_clearance", "other parameters", HIGH_FEET, 0.81873075, WIDE),
     Case("action_smoothness", "no change", {"action": [0.7] * 12, "previous_action": [0.7] * 12}, 0.0),
     Case("action_smoothness", "all by 0.25", {"action": [0.5] * 12, "previous_action": [0.25] * 12}, 0.86602540),
     # Mean 0.25, squared deviations 0.0225 + 0.0025 + 0.0025 + 0.0225, over 3.
     Case("air_time_variance", "unequal swings", {"foot_last_air_time": [0.1, 0.2, 0.3, 0.4]}, 0.05 / 3),
     Case("air_time_variance", "unequal stances", {"foot_last_contact_time": [0.4, 0.1, 0.3, 0.2]}, 0.05 / 3),
-    Case(
-        "air_time_variance",
-        "one swing cut at 0.5 s, and unequal stances",  # of 0.1 0.2 0.3 0.5: 0.0875 / 3
-        {"foot_last_air_time": [0.1, 0.2, 0.3, 0.9], "foot_last_contact_time": [0.1, 0.2, 0.3, 0.4]},
-        0.1375 / 3,
-    ),
+    Case("air_time_variance", "one swing cut at 0.5 s", {"foot_last_air_time": [0.1, 0.2, 0.3, 0.9]}, 0.0875 / 3),
     Case("air_time_variance", "equal legs", {"foot_last_air_time": [0.2] * 4, "foot_last_contact_time": [0.3] * 4}, 0),
-    Case(
-        "base_motion",
-        "heaving and tilting",  # 0.8 x 0.25 + 0.2 x (1 + 2)
-        {"base_lin_vel_b": [3.0, 3.0, -0.5], "base_ang_vel_b": [1.0, -2.0, 5.0]},
-        0.8,
-    ),
-    Case(
-        "base_motion",
-        "heaving and tilting, another weight",  # 0.5 x 0.25 + 0.5 x 3
-        {"base_lin_vel_b": [0.0, 0.0, -0.5], "base_ang_vel_b": [1.0, -2.0, 0.0]},
-        1.625,
-        {"heave_weight": 0.5},
-    ),
+    # 0.8 x 0.25 + 0.2 x (1 + 2), and 0.5 x 0.25 + 0.5 x 3
+    Case("base_motion", "heaving and tilting", HEAVING, 0.8),
+    Case("base_motion", "heaving and tilting, another weight", HEAVING, 1.625, {"heave_weight": 0.5}),
     Case("base_orientation", "level", {}, 0.0),
     Case("base_orientation", "rolled by 30 degrees", {"projected_gravity_b": [0.0, -0.5, -math.sqrt(0.75)]}, 0.5),
     Case("base_orientation", "on its back is level", {"projected_gravity_b": [0.0, 0.0, 1.0]}, 0.0),
@@ -312,42 +250,11 @@ CASES = [
     Case("joint_deviation", "standing at the nominal stance", {}, 0.0),
     Case("joint_deviation", "moving with all joints 0.1 off", {"command": WALK, "joint_pos": TENTH_OFF}, 0.34641016),
     Case("joint_deviation", "standing with all joints 0.1 off", {"joint_pos": TENTH_OFF}, 1.73205081),
-    Case(
-        "joint_deviation",
-        "standing with all joints 0.1 off, other parameters",
-        {"joint_pos": TENTH_OFF, "base_lin_vel_b": [0.9, 0.0, 0.0]},
-        0.69282032,
-        {"standing_scale": 2.0, "speed_threshold": 1.0},
-    ),
+    Case("joint_deviation", "twice as much while drifting", DRIFTING, 0.69282032, SLOW),
     Case("joint_position_limit", "the nominal stance", {}, 0.0),
-    # 95 % of the ranges: hip +-0.81985, thigh -0.556325..4.371325, calf -2.76975..-0.93625.
-    Case(
-        "joint_position_limit",
-        "six joints just outside the soft range",
-        {
-            "joint_pos": with_joints(
-                FR_hip=0.8199, RL_hip=-0.8199, FL_thigh=-0.5564, RR_thigh=4.3714, RR_calf=-2.7698, RL_calf=-0.9362
-            )
-        },
-        6.0,
-    ),
-    Case(
-        "joint_position_limit",
-        "six joints just inside the soft range",
-        {
-            "joint_pos": with_joints(
-                FR_hip=0.8198, RL_hip=-0.8198, FL_thigh=-0.5563, RR_thigh=4.3713, RR_calf=-2.7697, RL_calf=-0.9363
-            )
-        },
-        0.0,
-    ),
-    Case(
-        "joint_position_limit",
-        "the whole range",
-        {"joint_pos": with_joints(FR_hip=0.862, RL_hip=-0.864, FL_calf=-2.819)},
-        2.0,
-        {"soft_factor": 1.0},
-    ),
+    Case("joint_position_limit", "six joints just outside the soft range", OUTSIDE, 6.0),
+    Case("joint_position_limit", "six joints just inside the soft range", INSIDE, 0.0),
+    Case("joint_position_limit", "the whole range", BEYOND, 2.0, {"soft_factor": 1.0}),
     Case("joint_velocity_limit", "six fast joints", FAST, 6.0),
     Case("joint_velocity_limit", "a lower limit for the hips", FAST, 7.0, {"limit": (30.0, 30.1, 20.06)}),
     Case("thigh_contact", "two thighs", {"thigh_contact": [True, False, True, False]}, 2.0),
@@ -362,27 +269,15 @@ CASES = [
     Case("feet_air_time_literal", "another threshold", {"foot_air_time": [0.3, 0.1, 0, 0]}, 0.0, {"threshold": 0.1}),
     Case("foot_clearance_literal", "feet on the ground", {}, 1.25608533),  # exp(4 x 0.057)
     Case("foot_clearance_literal", "feet at the target", {"foot_height": [0.08] * 4}, 1.0),
-    Case(
-        "foot_clearance_literal",
-        "another target",  # exp(4 x 0.077)
-        {},
-        1.36070099,
-        {"target_height": 0.1},
-    ),
+    # exp(4 x 0.077)
+    Case("foot_clearance_literal", "another target", {}, 1.36070099, {"target_height": 0.1}),
     Case("air_time_variance_literal", "unequal swings", {"foot_last_air_time": [0.125, 0.25, 0.5, 1.0]}, 0.0),
     Case("base_motion_literal", "roll and pitch add", {"base_ang_vel_b": [-1.0, -2.0, 7.0]}, 3.0),
     Case("base_motion_literal", "roll and opposite pitch cancel", {"base_ang_vel_b": [1.5, -1.5, 7.0]}, 0.0),
     Case("foot_slip_literal", "two sliding feet bear force", SLIDING, 5.02493781),  # sqrt(5^2 + 0.5^2)
     Case("joint_deviation_literal", "all joints 0.1 off", {"joint_pos": TENTH_OFF}, 1.2),
-    Case(
-        "joint_deviation_literal", "left and right cancel", {"joint_pos": with_joints(FR_thigh=1.8, FL_thigh=-0.2)}, 0.0
-    ),
-    Case(
-        "joint_position_limit_literal",
-        "one of four joints beyond a hard stop is above it",
-        {"joint_pos": with_joints(FR_hip=0.8631, FL_hip=-0.8631, RR_hip=0.8629, RL_calf=-2.82)},
-        1.0,
-    ),
+    Case("joint_deviation_literal", "left and right cancel", with_joints(FR_thigh=1.8, FL_thigh=-0.2), 0.0),
+    Case("joint_position_limit_literal", "one of four joints beyond a stop is above it", ONE_ABOVE, 1.0),
     Case("joint_velocity_limit_literal", "three joints fast forwards", FAST, 3.0),
     Case("joint_velocity_limit_literal", "a lower limit for the hips", FAST, 4.0, {"limit": (30.0, 30.1, 20.06)}),
 ]

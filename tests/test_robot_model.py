@@ -21,9 +21,6 @@ POSES = {
 }
 """Joint angles (12,), rad: our nominal stance and two stances of published models."""
 
-MIRROR = np.diag([1.0, -1.0, 1.0])
-"""Reflection across the sagittal (x-z) plane."""
-
 
 # ----------------------------------------------------------------------------------------------------------- helpers
 
@@ -115,10 +112,6 @@ class Standing(NamedTuple):
 
     height: float
     pitch_deg: float
-    foot_loads: np.ndarray
-    """(4,) normal forces in SDK leg order, N."""
-    torques: np.ndarray
-    """(12,) actuator torques, N m."""
 
 
 @cache
@@ -137,16 +130,9 @@ def standing(pose: str, kp: float, kd: float) -> Standing:
     data.qpos[:7] = [0, 0, first_touch_height(POSES[pose]) + 1e-4, 1, 0, 0, 0]
     data.qpos[7:] = data.ctrl[:] = POSES[pose]
     mujoco.mj_step(model, data, nstep=round(8.0 / model.opt.timestep))
-    mujoco.mj_forward(model, data)
-
-    loads, force = np.zeros(4), np.zeros(6)
-    foot_of = {model.geom(f"{leg}_foot").id: i for i, leg in enumerate(robot.LEGS)}
-    for i in range(data.ncon):
-        mujoco.mj_contactForce(model, data, i, force)
-        loads[foot_of[int(max(data.contact.geom[i], key=lambda g: g in foot_of))]] += force[0]
     w, x, y, z = data.qpos[3:7]
     pitch = np.degrees(np.arcsin(2 * (w * y - x * z)))
-    return Standing(float(data.qpos[2]), float(pitch), loads, data.actuator_force.copy())
+    return Standing(float(data.qpos[2]), float(pitch))
 
 
 # ------------------------------------------------------------------------------------------------ names, order, sizes
@@ -308,19 +294,8 @@ def test_rotor_complete_trunk_is_the_trunk_with_four_hip_rotors() -> None:
     assert_allclose(actual.inertia, expected.inertia, atol=1e-10)
 
 
-@pytest.mark.parametrize(
-    ("kind", "moments"),
-    [
-        ("trunk", [0.0716565, 0.0630105, 0.0168101]),
-        ("hip", [7.34064e-4, 4.68438e-4, 3.98719e-4]),
-        ("thigh", [4.787172e-3, 4.609029e-3, 7.09268e-4]),
-        ("calf", [1.49767e-3, 1.484675e-3, 3.5843e-5]),
-    ],
-)
-def test_principal_moments(kind: str, moments: list[float]) -> None:
-    bodies = ["trunk"] if kind == "trunk" else [f"{leg}_{kind}" for leg in robot.LEGS]
-    for body in bodies:
-        assert_allclose(bare_model().body(body).inertia, moments, rtol=1e-5)
+def test_principal_moments_of_the_trunk() -> None:
+    assert_allclose(bare_model().body("trunk").inertia, [0.0716565, 0.0630105, 0.0168101], rtol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -346,21 +321,6 @@ def test_composite_inertia_about_the_com(pose: str, expected: list[float]) -> No
     assert_allclose([tensor[0, 0], tensor[1, 1], tensor[2, 2], tensor[0, 2]], expected, rtol=0.01)
 
 
-def test_mass_matrix_diagonal_without_armature() -> None:
-    model = bare_model()
-    mass_matrix = np.empty((model.nv, model.nv))
-    mujoco.mj_fullM(model, at_origin(model, POSES["home"]), mass_matrix)
-    legs = np.diag(mass_matrix)[6:].reshape(4, 3)
-    assert_allclose(legs, np.tile([0.017797, 0.017090, 0.005688], (4, 1)), rtol=0.01)
-
-
-def test_hanging_legs_need_the_torques_the_sdk_example_feeds_forward() -> None:
-    data = at_origin(bare_model(), np.tile([0.0, 1.2, -2.0], 4))
-    legs = data.qfrc_bias[6:].reshape(4, 3)
-    assert_allclose(legs[0], [-0.7016, 0.4665, -0.2073], atol=1e-3)
-    assert_allclose(legs[1], [0.7054, 0.4665, -0.2073], atol=1e-3)
-
-
 # ---------------------------------------------------------------------------------------------------------- kinematics
 
 
@@ -372,18 +332,13 @@ def test_hanging_legs_need_the_torques_the_sdk_example_feeds_forward() -> None:
         ((0.3, 0.5, -1.2), "FR", (0.223201, -0.019793, -0.357853)),
         ((0.3, 0.5, -1.2), "FL", (0.223201, 0.226561, -0.310570)),
         ((0.3, 0.5, -1.2), "RR", (-0.152999, -0.019793, -0.357853)),
+        ((0.3, 0.5, -1.2), "RL", (-0.152999, 0.226561, -0.310570)),
         ((-0.4, 1.1, -2.2), "FR", (0.1881, -0.195683, -0.146825)),
         ((-0.4, 1.1, -2.2), "FL", (0.1881, 0.045187, -0.209132)),
     ],
 )
 def test_foot_positions(angles: tuple[float, float, float], leg: str, foot: tuple[float, float, float]) -> None:
     assert_allclose(feet(np.tile(angles, 4))[robot.LEGS.index(leg)], foot, atol=1e-5)
-
-
-def test_mirrored_joints_give_mirrored_feet() -> None:
-    for joints in random_joints(50, seed=1):
-        mirrored = joints[list(robot.MIRROR_JOINTS)] * robot.MIRROR_JOINT_SIGNS
-        assert_allclose(feet(mirrored), feet(joints)[list(robot.MIRROR_LEGS)] @ MIRROR, atol=1e-12)
 
 
 def test_link_frames_are_parallel_when_the_legs_hang_straight() -> None:
@@ -415,28 +370,3 @@ def test_legs_settle_level_the_lower_the_softer(
     stand = standing(pose, *gains)
     assert stand.height == pytest.approx(height[0], abs=height[1])
     assert stand.pitch_deg == pytest.approx(pitch_deg[0], abs=pitch_deg[1])
-
-
-GAINS = [(20.0, 0.5), (35.0, 0.5), (100.0, 2.0)]
-
-
-@pytest.mark.parametrize(("kp", "kd"), GAINS)
-def test_feet_carry_the_weight(kp: float, kd: float) -> None:
-    loads = standing("isaac_lab", kp, kd).foot_loads
-    assert loads.sum() == pytest.approx(125.0, rel=0.05)
-    assert_within(loads[:2], 34.0, 36.0, 0.05)
-    assert_within(loads[2:], 26.0, 29.0, 0.05)
-
-
-@pytest.mark.parametrize(("kp", "kd"), GAINS)
-def test_peak_static_torques(kp: float, kd: float) -> None:
-    hip, thigh, calf = np.abs(standing("isaac_lab", kp, kd).torques).reshape(4, 3).max(axis=0)
-    assert_within(hip, 3.6, 4.7, 0.15)
-    assert_within(thigh, 1.3, 1.8, 0.15)
-    assert_within(calf, 5.1, 5.6, 0.15)
-
-
-def assert_within(value: np.ndarray | float, low: float, high: float, slack: float) -> None:
-    """Every value in the published range, widened by a relative tolerance at both ends."""
-    assert np.all(value >= low * (1 - slack)), value
-    assert np.all(value <= high * (1 + slack)), value
