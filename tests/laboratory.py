@@ -12,7 +12,7 @@ import go1exp.logs.record.motions  # noqa: F401  (registers every excitation)
 from go1exp.cli.app import parse
 from go1exp.cli.record import RecordSettings, rig_groups
 from go1exp.config.compose import compose
-from go1exp.config.schema.registry import Term, bind, bind_list
+from go1exp.config.schema.registry import Term, bind_list
 from go1exp.logs.record import plan, simulate
 from go1exp.logs.recording import Recording
 from go1exp.sim.env.plant import Plant
@@ -54,8 +54,7 @@ def at_rest(
 ) -> Plant:
     """Return the plant of one robot with effects, held at an attitude; its joints rest at ``start`` (1, J)."""
     backend, setup = robot.build(1, dt, quat, 1)
-    terms = [bind("effect", name, dict(values), name)[0] for name, values in effects.items()]
-    plant = Plant(backend, setup, robot.drive(), [term for term in terms if term])
+    plant = Plant(backend, setup, robot.drive(), bind_list("effect", [effects], "effect"))
     if kp or kd:
         plant.set_gains(torch.full_like(plant.q, kp), torch.full_like(plant.q, kd))
     plant.startup()

@@ -1,10 +1,11 @@
-"""A recording's metadata and a robot's state with usual values, for tests that care for a few; real recordings."""
+"""Metadata, a state, a command and a link with usual values, for tests that care for a few; real recordings."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,32 @@ def low_state(t: float = 0.0, **changes: Any) -> LowState:
 def low_cmd(**changes: Any) -> LowCmd:
     """Return a command that holds the nominal stance, with changes."""
     return dataclasses.replace(LowCmd(robot.NOMINAL_STANCE.copy(), np.full(12, 20.0), np.full(12, 0.5)), **changes)
+
+
+class FakeLink:
+    """Gives the states of a script, one list each cycle, and keeps what is sent."""
+
+    sent_at = math.nan
+
+    def __init__(self, script: Callable[[int], Sequence[LowState]]) -> None:
+        self.script, self.cycle = script, -1
+        self.sent: list[LowCmd] = []
+
+    def receive(self) -> Sequence[LowState]:
+        self.cycle += 1
+        return self.script(self.cycle)
+
+    def send(self, command: LowCmd) -> None:
+        self.sent.append(command)
+
+    def repeat(self) -> None:
+        pass
+
+    def rehearse(self, command: LowCmd) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
 
 
 def at(values: np.ndarray, k: int, value: float) -> np.ndarray:

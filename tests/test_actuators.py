@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from go1exp import robot
-from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.config.schema.registry import ConfigError, Term, members
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.actuator.actuator_net import ActuatorNet, load
@@ -141,13 +140,6 @@ def test_each_robot_draws_its_delay_anew_for_each_episode(drives: Drives) -> Non
     late.reset(again)
     assert torch.equal(late.delay[~again], first[~again])
     assert (late.delay[again] != first[again]).all()
-
-
-def test_a_robots_delays_are_its_own_and_follow_from_the_seed(drives: Drives) -> None:
-    batch, alone = (repeater(drives(n, random=EnvRandom(3, n, i)), 0.0, 0.02) for n, i in ((8, 0), (1, 5)))
-    assert torch.equal(batch.delay[5:6], alone.delay)
-    other = repeater(drives(8, random=EnvRandom(4, 8)), 0.0, 0.02)
-    assert not torch.equal(other.delay, batch.delay)
 
 
 def test_a_drive_without_delay_is_that_drive(make_core: Callable[..., Go1Core]) -> None:

@@ -62,16 +62,13 @@ def choices() -> list[str]:
     return found
 
 
-WITHOUT_RAMP = {"no_raised_weight": [], "no_close_kernels": ["track", "turn"], "no_diagonal_load": ["begin"]} | {
-    "no_touchdown_speed": [],
-    "no_widening": ["slow", "axes"],
-    "no_phases": [],
-    "no_schedule": [],
-    "no_mirrored_samples": [],
-}
-"""Ablations of departures from the paper, and the ramps of ``schedule=paper`` that go with them."""
+DEPARTURES_OF_THE_STUDY = (
+    *("no_raised_weight", "no_close_kernels", "no_diagonal_load", "no_touchdown_speed", "no_widening", "no_latency"),
+    "no_mirrored_samples",
+)
+"""Ablations of departures from the paper."""
 
-OTHERS = {"none", "no_curriculum", "no_latency", *WITHOUT_RAMP}
+OTHERS = {"none", "no_curriculum", "no_phases", "no_schedule", *DEPARTURES_OF_THE_STUDY}
 ABLATIONS = [
     name for c in choices() if c.startswith("experiment=ablation/") and (name := c.split("/")[1]) not in OTHERS
 ]
@@ -102,16 +99,25 @@ REWARD_GROUPS = {
     "no_contact": ["foot_slip", "foot_force", "thigh_contact", "calf_contact"],
     "no_limits": ["joint_position_limit", "joint_velocity_limit"],
 }
-NEUTRAL: dict[str, dict[str, Any]] = {
-    "foot_friction": {"range": [1.0, 1.0], "operation": "scale"},
-    "center_of_mass": {"range": [0.0, 0.0]},
-    "link_mass": {"range": [1.0, 1.0]},
-    "body_velocity": {"range": [0.0, 0.0]},
-    "body_position": {"range": [0.0, 0.0]},
-    "body_orientation": {"range": [0.0, 0.0]},
-    "joint_positions": {"range": [0.0, 0.0]},
-    "joint_velocities": {"range": [0.0, 0.0]},
-}
+
+
+def printed(table: str) -> dict[str, list[str]]:
+    """Return the rows of one of the paper's tables: the cells behind a term's name, with ASCII signs."""
+    section = (DOCS / "paper.md").read_text().replace("−", "-").split(f"## Table {table}: ")[1].split("\n\n|")[1]
+    rows = [line.strip("| ").split(" | ") for line in section.split("\n\n")[0].splitlines()]
+    return {match[1]: cells for name, *cells in rows if (match := re.search(r"\(`(\w+)`\)", name))}
+
+
+def interval(cell: str) -> tuple[float, float]:
+    """Return the two numbers of a cell such as ``Add (-0.5, 0.5)``."""
+    low, high = re.findall(r"-?[\d.]+", cell)
+    return float(low), float(high)
+
+
+TABLE_1 = {term: interval(cells[0]) for term, cells in printed("I").items() if cells[0] != "text only"}
+TABLE_2 = {term: (int(cells[0]), float(cells[-1])) for term, cells in printed("II").items()}
+TABLE_3 = {term: float(cells[0]) for term, cells in printed("III").items()}
+"""Term -> range; size and injected noise; weight."""
 
 
 def flat(node: Any, path: str = "") -> dict[str, Any]:
@@ -119,6 +125,13 @@ def flat(node: Any, path: str = "") -> dict[str, Any]:
     if not isinstance(node, Mapping):
         return {path: node}
     return {k: v for key, child in node.items() for k, v in flat(child, f"{path}.{key}".strip(".")).items()}
+
+
+def laid_over(base: Mapping[str, Any], experiment: str) -> dict[str, Any]:
+    """Return the configuration ``base`` with the values of an experiment's own file, and of nothing else."""
+    content = OmegaConf.to_container(OmegaConf.load(CONF / f"experiment/{experiment}.yaml"))
+    changes = flat(content)
+    return {k: v for k, v in base.items() if not k.startswith(tuple(f"{c}." for c in changes))} | changes
 
 
 @cache
@@ -134,8 +147,7 @@ def ablated(name: str, base: Mapping[str, Any]) -> dict[str, Any]:
     if name == "no_noise":
         return {k: 0.0 if k.endswith(".noise") and k != "eval.noise" else v for k, v in base.items()}
     if name.startswith("no_rand_"):
-        term = name.removeprefix("no_rand_")
-        return {**base, **{f"rand.{term}.{k}": v for k, v in NEUTRAL[term].items()}}
+        return laid_over(base, f"ablation/{name}")
     terms = REWARD_GROUPS.get(name, [name.removeprefix("no_")])
     return {**base, **{f"reward.{term}.weight": 0.0 for term in terms}}
 
@@ -181,52 +193,19 @@ def test_an_ablation_works_on_the_papers_setting() -> None:
         assert flat(compose("train", ["experiment=paper", f"+experiment/ablation={name}"])) == expected
 
 
-PROPRIOCEPTION = ["base_angular_velocity", "projected_gravity", "joint_position", "joint_velocity", "previous_action"]
-PARTS: dict[str, dict[str, Any]] = {
-    "none": {},
-    "no_mirrored_samples": {"ppo.symmetry": False},
-    "no_clock_rewards": {"reward.load_clock.weight": 0.0, "reward.foot_clock.weight": 0.0},
-    "no_smoothness": {
-        f"reward.{term}.weight": 0.0 for term in ("action_smoothness", "joint_acceleration", "joint_velocity")
-    },
-    "no_near_kernels": {"reward.near_linear_velocity.weight": 0.0, "reward.close_angular_velocity.weight": 0.0},
-    "with_history": {f"observation.{term}.history": 5 for term in PROPRIOCEPTION},
-}
-"""What each part of ``experiment=five_minutes`` changes."""
-
-
-def test_the_walking_study_changes_one_part_of_the_five_minutes_each() -> None:
-    files = {file.stem for file in (CONF / "experiment/five_minutes_part").glob("*.yaml")}
-    study = OmegaConf.load(CONF / "study/walking_cpu.yaml")
-    swept = study.hydra.sweeper.params["+experiment/five_minutes_part"].split(",")
-    assert files == set(swept) == set(PARTS)
-    base = flat(compose("train", ["experiment=five_minutes"]))
-    for name, changes in PARTS.items():
-        container = compose("train", [f"experiment=[five_minutes,five_minutes_part/{name}]"])
-        parse_train(container)
-        assert flat(container) == {**base, **changes}
-
-
-def test_the_study_takes_one_departure_away_each() -> None:
-    base = flat(compose("train", ["experiment=study"]))
-    printed = {"reward.linear_velocity_error.weight": 5.0, "reward.linear_velocity_error.ramp": 0.0}
-    printed |= {key: 2.8 for key in base if key.endswith("when.also.above")}
-    changes: dict[str, dict[str, Any]] = {
-        "none": {},
-        "no_latency": {"actuator.command": [0.0, 0.0]},
-        "no_raised_weight": printed,
-        "no_close_kernels": {f"reward.close_{kind}_velocity.weight": 0.0 for kind in ("linear", "angular")},
-        "no_diagonal_load": {"reward.diagonal_load.weight": 0.0},
-        "no_touchdown_speed": {"reward.touchdown_speed.weight": 0.0},
-        "no_mirrored_samples": {"ppo.symmetry": False},
-        "no_widening": {"command.start": 1.0, "command.zero_fraction": 0.0, "command.slow_fraction": 0.0},
-    }
-    for name, values in changes.items():
-        container = compose("train", ["experiment=study", f"+experiment/ablation={name}"])
-        parse_train(container)
-        gone = [f"schedule.{ramp}" for ramp in WITHOUT_RAMP.get(name, [])]
-        kept = {key: value for key, value in base.items() if not key.startswith(tuple(f"{g}." for g in gone))}
-        assert flat(container) == {**kept, **dict.fromkeys(gone), **values}, name
+def test_a_part_of_a_study_changes_what_its_file_says_and_nothing_else() -> None:
+    """Each value that the part names is in force, whatever the experiment sets."""
+    swept = OmegaConf.load(CONF / "study/walking_cpu.yaml").hydra.sweeper.params["+experiment/five_minutes_part"]
+    parts = {file.stem for file in (CONF / "experiment/five_minutes_part").glob("*.yaml")}
+    assert parts == set(swept.split(","))
+    studies = {"five_minutes": ("five_minutes_part", parts), "study": ("ablation", {"none", *DEPARTURES_OF_THE_STUDY})}
+    for study, (folder, names) in studies.items():
+        base = flat(compose("train", [f"experiment={study}"]))
+        for name in names:
+            container = compose("train", [f"experiment={study}", f"+experiment/{folder}={name}"])
+            parse_train(container)
+            assert flat(container) == laid_over(base, f"{folder}/{name}"), name
+            assert (flat(container) == base) == (name == "none"), name
 
 
 def test_without_phases_or_a_schedule() -> None:
@@ -254,7 +233,7 @@ def test_the_study_has_24_parts_by_three_seeds() -> None:
     assert params["seed"] == "0,1,2"
     names = {name.strip() for name in params["+experiment/ablation"].split(",")}
     assert len(names) == 24
-    assert {*REWARD_GROUPS, *WITHOUT_RAMP, "none", "no_rand", "no_push", "no_noise", "no_latency"} < names
+    assert {*REWARD_GROUPS, *OTHERS - {"no_curriculum"}, "no_rand", "no_push", "no_noise"} < names
     for name in names:  # a ramp may wait for a reward that the variant takes away
         preflight.check(parse_train(compose("train", [f"+experiment/ablation={name}"])))
 
@@ -303,7 +282,7 @@ def test_an_ablated_reward_is_not_computed(make_core: Callable[..., Go1Core]) ->
     assert not [key for key in metrics if key.endswith("_limit")]
 
 
-@pytest.mark.parametrize("term", NEUTRAL)
+@pytest.mark.parametrize("term", TABLE_1)
 def test_a_neutral_range_equals_the_term_removed(term: str, make_core: Callable[..., Go1Core]) -> None:
     def rollout(*overrides: str) -> torch.Tensor:
         core = make_core("sim.episode_s=0.1", "actuator=pd", "contact=soft", *overrides, num_envs=2)
@@ -319,26 +298,7 @@ def test_a_neutral_range_equals_the_term_removed(term: str, make_core: Callable[
     assert not torch.equal(neutral, rollout())
 
 
-# ---------------------------------------------------------------------- the paper, by the tables of docs/paper.md
-
-
-def printed(table: str) -> dict[str, list[str]]:
-    """Return the rows of one of the paper's tables: the cells behind a term's name, with ASCII signs."""
-    section = (DOCS / "paper.md").read_text().replace("−", "-").split(f"## Table {table}: ")[1].split("\n\n|")[1]
-    rows = [line.strip("| ").split(" | ") for line in section.split("\n\n")[0].splitlines()]
-    return {match[1]: cells for name, *cells in rows if (match := re.search(r"\(`(\w+)`\)", name))}
-
-
-def interval(cell: str) -> tuple[float, float]:
-    """Return the two numbers of a cell such as ``Add (-0.5, 0.5)``."""
-    low, high = re.findall(r"-?[\d.]+", cell)
-    return float(low), float(high)
-
-
-TABLE_1 = {term: interval(cells[0]) for term, cells in printed("I").items() if cells[0] != "text only"}
-TABLE_2 = {term: (int(cells[0]), float(cells[-1])) for term, cells in printed("II").items()}
-TABLE_3 = {term: float(cells[0]) for term, cells in printed("III").items()}
-"""Term -> range; size and injected noise; weight."""
+# ---------------------------------------------------------------------- the paper
 
 
 @cache

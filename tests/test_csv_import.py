@@ -110,12 +110,6 @@ def test_the_same_table_in_other_notations_is_the_same_recording(tmp_path: Path)
             np.testing.assert_array_equal(other.channels[name], values, name)
 
 
-def test_a_folder_is_an_episode_for_each_file(tmp_path: Path) -> None:
-    for name in ("one", "two"):
-        lay(tmp_path / f"{name}.csv")
-    assert [r.meta.episode for r in import_recordings("csv", tmp_path, OPTIONS)] == ["one", "two"]
-
-
 def test_nanoseconds_since_1970_keep_their_steps(tmp_path: Path) -> None:
     start = 1_700_000_000_123_456_789
     (tmp_path / "x.csv").write_text("n,p\n" + "".join(f"{start + 1_000_001 * k},0.{k}\n" for k in range(5)))

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import IO, Any, cast
+from typing import IO, Any
 
 import numpy as np
 import pytest
@@ -61,9 +61,9 @@ from go1exp.logs.record.motions import played
 from go1exp.logs.record.plan import make_motion
 from go1exp.logs.recording import VECTORS
 from go1exp.robot.go1_fields import JOINTS, MOTOR_NAMES
-from go1exp.robot.messages import Link, LowCmd, LowState
+from go1exp.robot.messages import LowState
 from tests.lockstep import BEGIN, Spoil, lockstep
-from tests.made import low_cmd, low_state
+from tests.made import FakeLink, low_cmd, low_state
 from tests.small_run import SMALL
 
 BUSY = 5.0
@@ -514,26 +514,17 @@ def test_a_robot_that_never_speaks_is_waited_for_and_not_commanded(bundle: str, 
 
 
 def test_a_link_that_breaks_ends_the_walk_with_a_log(bundle: str) -> None:
-    sent: list[LowCmd] = []
-    calls = iter(range(100))
-
-    def receive() -> list[LowState]:
-        if next(calls) == 5:
+    def states(cycle: int) -> list[LowState]:
+        if cycle == 5:
             raise RobotError("the SDK failed")
         return [make_state(time.perf_counter(), clock=math.nan)]
 
-    def nothing(*_: object) -> None: ...
-
-    link = SimpleNamespace(
-        sent_at=math.nan, receive=receive, send=sent.append, repeat=nothing, rehearse=nothing, close=nothing
-    )
-    outcome = walk.walk(
-        load(bundle), cast(Link, link), Plan(rate=500.0, stale=BUSY, stand_up=0.004, seconds=5.0, spin=0.0)
-    )
+    link = FakeLink(states)
+    outcome = walk.walk(load(bundle), link, Plan(rate=500.0, stale=BUSY, stand_up=0.004, seconds=5.0, spin=0.0))
     assert outcome.fault is not None
     assert (outcome.fault.name, outcome.fault.message) == ("runtime", "RobotError: the SDK failed")
     assert outcome.status == STATUS["runtime"]
-    assert [command.damping for command in sent] == [False] * 5 + [True]
+    assert [command.damping for command in link.sent] == [False] * 5 + [True]
     assert outcome.log.states.count == 5
 
 

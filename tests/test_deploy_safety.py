@@ -22,7 +22,7 @@ from go1exp.deploy.runtime.loop import Deadlines, MonotonicClock, Timing, run
 from go1exp.deploy.runtime.metadata import Port
 from go1exp.deploy.runtime.safety import RULES, Safety, SafetyConfig, sdk_range, tilt_angle
 from go1exp.robot.messages import LowCmd, LowState
-from tests.made import at, low_cmd, low_state
+from tests.made import FakeLink, at, low_cmd, low_state
 
 NOMINAL = robot.NOMINAL_STANCE
 LIMIT = robot.per_joint(robot.EFFORT_LIMIT)
@@ -232,32 +232,6 @@ def test_torque_that_is_fed_forward_is_cut_too_and_counts_in_what_targets_need()
 # ---------------------------------------------------------------------- the controller
 
 
-class FakeLink:
-    """Gives the states of a script, one list each cycle, and keeps what is sent."""
-
-    sent_at = math.nan
-
-    def __init__(self, script: Callable[[int], Sequence[LowState]]) -> None:
-        self._script, self.cycle = script, -1
-        self.sent: list[LowCmd] = []
-
-    def receive(self) -> Sequence[LowState]:
-        self.cycle += 1
-        return self._script(self.cycle)
-
-    def send(self, command: LowCmd) -> None:
-        self.sent.append(command)
-
-    def repeat(self) -> None:
-        pass
-
-    def rehearse(self, command: LowCmd) -> None:
-        pass
-
-    def close(self) -> None:
-        pass
-
-
 class FakePolicy:
     """Answers with its command, as an action for every joint."""
 
@@ -412,9 +386,9 @@ def test_states_that_are_taken_before_their_cycle_count_once_and_in_order() -> N
     early.it._on_cycle = lambda cycle: states.append([state.t for state in cycle.fresh])
     for k in range(20):
         plain.run_cycles(1, k)
-        early.link._script = lambda _, k=k: always(k)[:3]
+        early.link.script = lambda _, k=k: always(k)[:3]
         early.it.prepare()
-        early.link._script = lambda _, k=k: always(k)[3:]
+        early.link.script = lambda _, k=k: always(k)[3:]
         early.run_cycles(1, k)
     assert states == [[state.t for state in always(k)] for k in range(20)]
     assert early.it._estimator.count == plain.it._estimator.count == 100

@@ -18,7 +18,7 @@ from torch import Tensor
 from go1exp import robot
 from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.config.compose import compose
-from go1exp.config.schema.registry import bind
+from go1exp.config.schema.registry import bind_list
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.effects.base import Gears, Measured
 from go1exp.sim.effects.gears import TwoMass
@@ -36,13 +36,13 @@ Quat = tuple[float, float, float, float]
 LEVEL: Quat = (1.0, 0.0, 0.0, 0.0)
 
 
-@cache
 def engine(plant: Plant) -> MujocoCpu:
     """The plant's physics, to look into."""
     assert isinstance(plant.backend, MujocoCpu)
     return plant.backend
 
 
+@cache
 def task() -> TaskConfig:
     return parse_task(compose("train", plain("rand=none", "backend.threads=1")))
 
@@ -60,11 +60,7 @@ def rig(
 ) -> Plant:
     """Build robots with effects, at rest in ``stance``."""
     backend = MujocoCpu(*build_model(task().robot, build_terrain(task().terrain), dt, held=held), n, 1)
-    terms = []
-    for name, values in effects.items():
-        term, problems = bind("effect", name, dict(values), f"effect.{name}")
-        assert term, problems
-        terms.append(term)
+    terms = bind_list("effect", [effects], "effect")
     plant = Plant(backend, actuator_setup(task().robot, dt, backend, EnvRandom(0, n)), task().actuator, terms)
     plant.set_gains(*(torch.full_like(plant.q, gain) for gain in (kp, kd)))
     plant.startup()

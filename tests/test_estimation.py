@@ -6,7 +6,6 @@ Run as a script with a folder, it takes the extension from there: ``make sanitis
 from __future__ import annotations
 
 import json
-import os
 import runpy
 import subprocess
 import sys
@@ -46,6 +45,7 @@ from go1exp.logs.recording import VECTORS
 from go1exp.mdp.kinematics import foot_positions
 from go1exp.sim.task import parse_task
 from tests.kalman import NumpyFilter, foot
+from tests.made import real
 
 GRAVITY = np.array([0.0, 0.0, 9.81])
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
@@ -485,11 +485,8 @@ def test_a_simulated_go1_that_squats_is_followed(source: Literal["force", "torqu
 def test_on_the_real_scaler_it_beats_leg_odometry_by_far() -> None:
     from benchmarks.mocap import evaluate
 
-    root = Path(os.environ.get("GO1EXP_DATA", data_root().parent / "shared/data"))
-    if not (root / "scaler_walk_mocap").is_dir():
-        pytest.skip(f"no scaler_walk_mocap in {root}; set GO1EXP_DATA")
     for run in (15, 23):
-        states = evaluate(root / f"scaler_walk_mocap/run_{run}.npz", scaler())
+        states = evaluate(real(f"scaler_walk_mocap/run_{run}.npz"), scaler())
         assert states.filter_rmse < 0.09, states
         assert states.filter_rmse < 0.7 * states.odometry_rmse, states
         assert abs(states.filter_distance) < 0.6 * abs(states.odometry_distance), states

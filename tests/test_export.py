@@ -36,13 +36,13 @@ from go1exp.deploy.runtime.metadata import Metadata
 from go1exp.deploy.runtime.policy import OnnxPolicy
 from go1exp.deploy.runtime.safety import Safety
 from go1exp.mdp.types import Snapshot
-from go1exp.robot.messages import Link, LowCmd, LowState
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import ActionConfig, TaskConfig, parse_task, parse_train
 from go1exp.train import run_folder
 from go1exp.train.policy import load_policy
 from go1exp.train.ppo import GaussianPolicy
 from tests.command import run_alone
+from tests.made import FakeLink, low_state
 from tests.small_run import trained
 
 OBSERVATIONS = sorted(p.stem for p in (data_root() / "conf/observation").glob("*.yaml"))
@@ -497,26 +497,20 @@ def test_the_runtime_does_on_the_traces_readings_what_the_environment_did(good: 
     apart = np.flatnonzero(np.diff(trace["time"]) > 0.021)  # where an episode ended
     rows = int(apart[0]) + 1 if len(apart) else len(trace["time"])
     assert rows > 5
-    still = np.zeros(12)
+    measured = ("joint_pos", "joint_vel", "imu_quat", "imu_gyro")
     states = [
-        LowState(
-            t=float(trace["time"][k]),
-            joint_torque=still,
-            imu_acc=np.zeros(3),
-            foot_force=np.zeros(4),
-            **{name: trace[f"input.{name}"][k] for name in ("joint_pos", "joint_vel", "imu_quat", "imu_gyro")},
-        )
+        low_state(float(trace["time"][k]), **{name: trace[f"input.{name}"][k] for name in measured})
         for k in range(rows)
     ]
-    sent: list[LowCmd] = []
     observed: list[Any] = []
-    link = SimpleNamespace(receive=lambda: [states[len(sent)]], send=sent.append, sent_at=0.0)
+    link = FakeLink(lambda k: [states[k]])
+    sent = link.sent
     commands = lambda t: trace["input.command"][len(sent)]  # noqa: E731
     estimator = SimpleNamespace(update=lambda state: None, ahead=lambda age: trace["input.base_lin_vel_b"][len(sent)])
     safety = Safety(robot.JOINTS, robot.JOINT_POS_LIMITS, np.array(good.metadata.torque_limit))
     gains: dict[str, Any] = {"kp": np.array(good.metadata.kp), "kd": np.array(good.metadata.kd)}
     about: dict[str, Any] = {"stages": Stages(stand_up=0.0), "on_cycle": observed.append, **gains}
-    runtime = Controller(good, cast(Link, link), commands, estimator, safety, **about)
+    runtime = Controller(good, link, commands, estimator, safety, **about)
     for state in states:
         assert runtime.cycle(state.t)
     assert safety.fault is None

@@ -19,7 +19,6 @@ from go1exp.cli.hydra_main import choices_from_files
 from go1exp.config.compose import compose
 from go1exp.config.schema.physics import MUJOCO_CONTACT, ContactConfig
 from go1exp.gap import files
-from go1exp.gap.comparison import prepare
 from go1exp.gap.result import AngleErrors, Candidate, Floors, GapResult, GapSettings, Localisation, NamedEffect, Overlay
 from go1exp.gap.robots.go1 import suspended
 from go1exp.gap.stages.apply import CALIBRATION, COMPENSATING, EFFECT, composed, prove, terms_of, theta_of, write
@@ -384,15 +383,6 @@ def test_logs_of_another_robot_or_without_what_is_needed_are_refused() -> None:
         assert list(answer.warnings) == flaws
         assert flaws[0] in answer.sentence
         assert answer.floors is None
-
-
-def test_one_bad_log_of_many_is_left_out_and_said() -> None:
-    rig, recordings = robot()
-    stuck = {**recordings[0].channels, "q_FR_hip": np.full(len(recordings[0].t), 0.1)}
-    _, ready = prepare([replace(recordings[0], channels=stuck), *recordings[1:]], suspended(rig.robot), GapSettings())
-    assert ready.recordings == recordings[1:]
-    assert ready.warnings
-    assert all(w.startswith(f"Left out: {recordings[0].meta.episode}: ") for w in ready.warnings)
 
 
 def test_logs_that_are_too_short_are_refused() -> None:

@@ -10,7 +10,7 @@ import torch
 
 from go1exp import robot
 from go1exp.config.compose import compose
-from go1exp.config.schema.registry import bind
+from go1exp.config.schema.registry import bind_list
 from go1exp.gap.replay.replayer import LEVEL, hold
 from go1exp.gap.robots.go1 import suspended
 from go1exp.sim.env.plant import Plant
@@ -26,8 +26,7 @@ def moved(num: int, built: Any, quats: np.ndarray | None, mounted: bool, effects
     backend, setup = machine.build(num, DT, built, 1, mounted)
     if quats is not None:
         hold(backend, quats)
-    terms = [bind("effect", name, values, name)[0] for name, values in effects.items()]
-    plant = Plant(backend, setup, machine.drive(), [term for term in terms if term])
+    plant = Plant(backend, setup, machine.drive(), bind_list("effect", [effects], "effect"))
     plant.set_gains(torch.full_like(plant.q, 20.0), torch.full_like(plant.q, 0.5))
     plant.startup()
     qpos = torch.zeros_like(backend.qpos)

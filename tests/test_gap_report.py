@@ -658,13 +658,6 @@ def test_a_slow_log_whose_speeds_fit_is_left_out_and_not_taken_for_milliseconds(
     assert capsys.readouterr().out.endswith("a log of joints must step by at most 0.1 s\n")
 
 
-def test_logs_that_are_all_too_short_are_bad_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (recording,) = read_all(str(DEMO[0]))
-    write(tmp_path / "short.parquet", replace(recording, channels={k: v[:5] for k, v in recording.channels.items()}))
-    assert APP.run([f"logs={tmp_path}", f"out={tmp_path / 'gap'}"]) == EXIT_CODES["bad log"]
-    assert "none of these recordings can be compared" in capsys.readouterr().err
-
-
 def test_what_an_earlier_answer_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
     for name in ("effect.yaml", "applied.json", "report.html", "mine.txt", "next.csv"):
         (tmp_path / name).write_text("{}")

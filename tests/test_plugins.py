@@ -137,14 +137,6 @@ def test_a_file_of_terms_is_there_for_the_configuration_that_names_it_and_for_no
         parse_task(compose("train", ["+reward.lazy.weight=-1"]))
 
 
-def test_the_environment_variable_names_plugins_for_everything(monkeypatch: pytest.MonkeyPatch) -> None:
-    write("my_terms.py", LAZY)
-    write("more.py", LAZY.replace("lazy", "lazier"))
-    monkeypatch.setenv(plugins.VARIABLE, os.pathsep.join(["my_terms.py", "more.py"]))
-    task = parse_task(compose("train", ["+reward.lazy.weight=-1", "+reward.lazier.weight=-1"]))
-    assert [t.key for t in task.reward[-2:]] == ["lazy", "lazier"]
-
-
 def test_a_file_named_twice_is_loaded_once(monkeypatch: pytest.MonkeyPatch) -> None:
     write("my_terms.py", LAZY + "\nimport sys\nsys.loaded = getattr(sys, 'loaded', 0) + 1\n")
     monkeypatch.setattr(sys, "loaded", 0, raising=False)

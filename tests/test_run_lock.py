@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from go1exp.base.paths import data_root
 from go1exp.config.compose import compose
 from go1exp.train import run_folder, run_state
+from tests.command import environment, run_alone
 from tests.small_run import SMALL
 
 HOLD = """
@@ -28,8 +28,6 @@ with run_state.locked(run):
     print("locked", flush=True)
     sys.stdin.read()
 """
-COMMAND_LINE = "import sys; from go1exp.cli import main; sys.exit(main())"
-ENVIRONMENT = {**os.environ, "PYTHONPATH": str(data_root())}
 
 
 @pytest.fixture
@@ -38,7 +36,7 @@ def holder(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     run_folder.write(tmp_path / "run", compose("train", SMALL))
     process = subprocess.Popen(
         [sys.executable, "-c", HOLD, str(tmp_path / "run")],
-        env=ENVIRONMENT,
+        env=environment(),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -60,14 +58,7 @@ def test_a_second_training_in_a_folder_is_refused_in_one_line(
     run = tmp_path / "run"
     settings = SMALL if again.startswith("hydra") else ()
     before = {p: p.read_bytes() for p in run.iterdir() if p.is_file()}
-    done = subprocess.run(
-        [sys.executable, "-c", COMMAND_LINE, "train", *settings, again.format(run=run)],
-        cwd=tmp_path,
-        env=ENVIRONMENT,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    done = run_alone(tmp_path, "train", *settings, again.format(run=run))
     assert done.returncode == 1, done.stderr
     who = rf"process {holder.pid} on {re.escape(socket.gethostname())} since \d{{4}}-\d\d-\d\d \d\d:\d\d:\d\d"
     assert re.fullmatch(rf"go1exp train: {re.escape(str(run))}: in use by {who}; .*\n", done.stderr), done.stderr

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-from go1exp.base.paths import data_root
+from tests.command import COMMAND_LINE, run_alone
 
 WHILE_LOADING = """
 import os, signal, sys
@@ -21,7 +18,6 @@ class Interrupt:
 sys.meta_path.insert(0, Interrupt())
 {program}
 """
-PROGRAM = "from go1exp.cli import main; sys.exit(main())"
 WORKING = pytest.mark.slow("go1exp/cli/", "go1exp/base/signals.py", "go1exp/evaluate/", "go1exp/logs/record/")
 RUNTIME = "from go1exp.deploy.__main__ import main; sys.exit(main(sys.argv[1:]))"
 
@@ -38,24 +34,13 @@ RUNTIME = "from go1exp.deploy.__main__ import main; sys.exit(main(sys.argv[1:]))
     ],
 )
 def test_a_signal_at_any_time_is_one_line_and_a_status(arguments: str, module: str, name: str, tmp_path: Path) -> None:
-    code = WHILE_LOADING.format(module=module, name=name, program=PROGRAM)
-    done = interrupted(tmp_path, code, arguments)
+    code = WHILE_LOADING.format(module=module, name=name, program=COMMAND_LINE)
+    done = run_alone(tmp_path, *arguments.split(), code=code)
     assert (done.returncode, done.stderr) == (130, f"go1exp {arguments.split()[0]}: stopped\n")
     assert not list(tmp_path.rglob(".hydra"))
 
 
 def test_the_runtime_of_the_robot_ends_with_one_line_too(tmp_path: Path) -> None:
     code = WHILE_LOADING.format(module="numpy", name="SIGHUP", program=RUNTIME)
-    done = interrupted(tmp_path, code, "nowhere.zip")
+    done = run_alone(tmp_path, "nowhere.zip", code=code)
     assert (done.returncode, done.stderr) == (130, "go1exp.deploy: stopped\n")
-
-
-def interrupted(cwd: Path, code: str, arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", code, *arguments.split()],
-        cwd=cwd,
-        env={**os.environ, "PYTHONPATH": str(data_root())},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )

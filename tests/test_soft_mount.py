@@ -21,7 +21,7 @@ from go1exp import robot
 from go1exp.base.paths import data_root
 from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.config.compose import compose
-from go1exp.config.schema.registry import Term, bind
+from go1exp.config.schema.registry import Term, bind_list
 from go1exp.gap.data.prepare import Ready
 from go1exp.gap.replay.replayer import LEVEL, Replayer
 from go1exp.gap.replay.rows import Rows, Theta, mounted, on_fixed_base, variants
@@ -57,10 +57,8 @@ SOFT = {"sway": 5e-4, "heave": 2e-4, "roll": 0.01, "pitch": 0.02, "damping": 0.1
 COMPLIANCE = [SOFT[name] for name in ("sway", "sway", "heave", "roll", "pitch")]
 
 
-def soft(values: Mapping[str, Any]) -> Term:
-    term, problems = bind("effect", "soft_mount", dict(values), "effect.soft_mount")
-    assert term, problems
-    return term
+def soft(values: Mapping[str, Any]) -> list[Term]:
+    return bind_list("effect", [{"soft_mount": values}], "effect")
 
 
 def block(folder: Path, values: Mapping[str, Any], dt: float, quat: tuple[float, ...] = TILTED) -> Plant:
@@ -71,7 +69,7 @@ def block(folder: Path, values: Mapping[str, Any], dt: float, quat: tuple[float,
     assert isinstance(config, ModelConfig)
     machine = FixedBase.from_config(config)
     backend, setup = machine.build(1, dt, quat, 1, mounted=True)
-    plant = Plant(backend, setup, machine.drive(), [soft(values)])
+    plant = Plant(backend, setup, machine.drive(), soft(values))
     plant.set_gains(torch.zeros(1, 1).double(), torch.zeros(1, 1).double())
     plant.startup()
     return plant
@@ -143,7 +141,7 @@ def hanging(dt: float, rows: list[Mapping[str, float]], mount: bool = True) -> P
     """Hang up Go1s, each on a mount of its own."""
     ground = build_terrain(task().terrain)
     backend = MujocoCpu(*build_model(task().robot, ground, dt, held=(1.0, 0.0, 0.0, 0.0), mounted=mount), len(rows), 1)
-    terms = [soft({})] if mount else []
+    terms = soft({}) if mount else []
     plant = Plant(backend, actuator_setup(task().robot, dt, backend, EnvRandom(0, len(rows))), task().actuator, terms)
     for k, values in enumerate(rows):
         for name, value in values.items():
@@ -250,8 +248,8 @@ def test_a_mount_takes_energy_from_a_robot_that_nothing_drives() -> None:
 
 def test_only_a_mount_that_gives_way_needs_joints_of_the_trunk() -> None:
     assert not on_mount([])
-    assert not on_mount([soft({"damping": 0.5})])
-    assert on_mount([soft({"roll": 1e-5})])
+    assert not on_mount(soft({"damping": 0.5}))
+    assert on_mount(soft({"roll": 1e-5}))
 
 
 def test_rows_without_compliance_are_simulated_bolted() -> None:
