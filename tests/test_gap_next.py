@@ -37,7 +37,10 @@ from go1exp.gap.robots.description import ModelConfig
 from go1exp.gap.robots.fixed_base import FixedBase
 from go1exp.gap.robots.go1 import suspended
 from go1exp.gap.search import tolerances
+from go1exp.gap.search.screen import Motion
+from go1exp.gap.search.screen import library as ways
 from go1exp.gap.stages import next as stage_next
+from go1exp.gap.stages.explain import check
 from go1exp.gap.stages.next import NextResult
 from go1exp.logs import recording
 from go1exp.logs.excitations import ExcitationError
@@ -45,6 +48,7 @@ from go1exp.logs.record.motions import playback
 from go1exp.logs.record.simulate import held_quat
 from go1exp.logs.recording import Recording, joint_channels
 from go1exp.robot import JOINTS, NOMINAL_STANCE, soft_limits
+from go1exp.sim.effects.tolerances import Tolerances
 from tests import made
 from tests.command import refuse
 from tests.laboratory import at_rest, recorded
@@ -334,9 +338,47 @@ def test_a_named_effect_is_held_against_all_that_is_known_to_look_like_it() -> N
 
 
 def test_what_was_not_excited_is_a_question_too() -> None:
-    found = stage_next.unseen(answer(not_excited={"joint_stop": "steps", "payload": "squat"}), robot())
+    moved = Motion(np.zeros(12), np.full(12, -0.5), np.full(12, 0.5), np.full(12, 0.4))
+    found = stage_next.unseen(answer(not_excited={"joint_stop": "steps", "payload": "squat"}), robot(), moved)
     assert [(p.truth, p.rival) for p in found] == [("joint_stop", "")]  # a held trunk feels no payload
     assert found[0].theta["joint_stop", "time_constant"].shape == (12,)
+
+
+def test_every_effect_is_probed_at_twice_its_tolerance_however_narrow_that_is() -> None:
+    moved = Motion(np.zeros(12), np.full(12, -0.5), np.full(12, 0.5), np.full(12, 0.4))
+    narrow = {"fixed_point": {"steps": 0.4}, "dead_band": {"band": 1e-4}}
+    machine = suspended(robot().config, Tolerances.from_effects(narrow))
+    for one in (robot(), machine):
+        least: dict[str, float] = {}
+        for v in ways(one, moved):
+            for p in v.probes:
+                change = float(np.abs(p.delta).max()) / one.tolerances.param((v.effect, p.key[1])).tolerance
+                least[v.effect] = min(least.get(v.effect, np.inf), change)
+        known = tolerances.nominal(one)
+        assert {effect: change for effect, change in least.items() if change > 3.01 and effect not in known} == {}
+
+
+@pytest.mark.slow("go1exp/gap/", "tests/")
+def test_gap_and_gap_next_agree_about_what_is_not_excited(arm: FixedBase, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tolerances, "nominal", lambda machine: ("viscous",))
+    monkeypatch.setattr("go1exp.gap.design.plan.MOTIONS", (("chirp", {"band": (0.5, 10.0)}),))
+    search = replace(SETTINGS, effects=("lag", "fixed_point", "joint_stop"))
+    slow = told(arm, ("slow_ramps",) * 3, amplitude=(0.005, 0.03))
+    quiet = check(slow, arm, search).not_excited
+    assert set(quiet) == {"lag", "fixed_point", "joint_stop"}
+    result = answer(verdict="no gap", named=(), box={}, not_excited={**quiet, "payload": "squat"})
+    design_settings = DesignSettings(designs=12, refine=0, gains=((1.0, 1.0),), seconds=3.0)
+    found = stage_next.design(result, slow, arm, search, design_settings)
+    assert {p.truth for p in found.pairs} == set(quiet)
+    assert found.distinguishable == ()
+    assert dict(found.standing) == {"payload": "squat"}
+    shown = {p.truth for p in found.pairs if not p.reason}
+    assert shown == {"lag"}
+    fast = told(arm, ("chirp",) * 3, **found.best.design.parameters)
+    assert shown.isdisjoint(check([*slow, *fast], arm, search).not_excited)
+    said = text(found, Path("x"))
+    assert "whether there is lag: not excited by the logs at hand, " in said
+    assert "only a robot on its feet shows payload: excitation=squat" in said
 
 
 def test_an_answer_without_names_has_no_question() -> None:

@@ -121,6 +121,9 @@ def text(result: NextResult, file: Path) -> str:
     """Return a result as lines for people; ``file`` is where its targets are."""
     known = ", ".join(result.distinguishable)
     lines = [f"already distinguishable by the logs at hand: {known}"] if known else []
+    if result.standing:
+        names, how = ", ".join(result.standing), ", ".join(dict.fromkeys(result.standing.values()))
+        lines.append(f"only a robot on its feet shows {names}: excitation={how}")
     if result.verdict == "nothing left":
         return "\n".join([*lines, "nothing is left to distinguish: no further recording is needed for the answer"])
     best = result.best

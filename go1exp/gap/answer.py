@@ -20,6 +20,7 @@ from go1exp.gap.search import reduction, thresholds, tolerances
 from go1exp.gap.search.candidates import beyond, bounded, deviation, unexcited_rows
 from go1exp.gap.search.certainty import beside_a_gap, doubt, exact_aliases, resampled_values, widened
 from go1exp.gap.search.fit import residuals
+from go1exp.gap.search.screen import shows
 from go1exp.gap.search.state import LastCheck, Search
 from go1exp.sim.effects.base import Param
 from go1exp.sim.effects.tolerances import Tolerances, declared, sizes
@@ -32,7 +33,7 @@ def can_stand(robot: Robot) -> bool:
 
 def not_excited(signal: Mapping[str, float], held: bool = True) -> dict[str, str]:
     """Return effects that these data cannot show, and the excitation that would; ``held``: a trunk is that has feet."""
-    unexcited = [effect for effect, level in signal.items() if level < thresholds.NOT_EXCITED]
+    unexcited = [effect for effect, level in signal.items() if not shows(level)]
     unfelt = [effect for effect in members("effect") if held and tolerances.identification(effect).needs_ground]
     return {effect: tolerances.identification(effect).excitation for effect in (*unexcited, *unfelt)}
 
@@ -228,7 +229,7 @@ def decide(search: Search, named: Sequence[NamedEffect], final: float, accepted:
     (``search.bootstraps=0``) their certainty is unknown.
     """
     settings, first = search.settings, search.first
-    excited = [effect for effect, s in search.signal.items() if s >= thresholds.NOT_EXCITED]
+    excited = [effect for effect, level in search.signal.items() if shows(level)]
     if named:
         certain = not settings.bootstraps or any(n.status == "certified" for n in named)
         return "explained" if accepted or (certain and final <= settings.adequate) else "partly explained"
@@ -239,7 +240,8 @@ def decide(search: Search, named: Sequence[NamedEffect], final: float, accepted:
 
 def evidence(search: Search) -> tuple[Candidate, ...]:
     """Return the candidates, best first, with those that the data cannot show."""
-    quiet = unexcited_rows(search.signal, thresholds.NOT_EXCITED, [c.effect for c in search.candidates])
+    unexcited = [effect for effect, level in search.signal.items() if not shows(level)]
+    quiet = unexcited_rows(unexcited, [c.effect for c in search.candidates])
     accepted = {c.effect for c in search.candidates if c.status == "accepted"} - set(search.state.terms)
     kept = [
         replace(c, status="rejected", reason="dropped: the other terms do as well without it")

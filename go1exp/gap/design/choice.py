@@ -17,6 +17,7 @@ from go1exp.gap.result import GapSettings
 from go1exp.gap.score.likelihood import Scorer, log_chi2
 from go1exp.gap.score.linear import Layout, Table, predicted
 from go1exp.gap.search import tolerances
+from go1exp.gap.search.screen import shows
 from go1exp.gap.search.state import State
 
 FITTED = 24  # windows of the recordings at hand on which rivals are fitted and compared, at most
@@ -35,7 +36,8 @@ class Pair:
     without: Theta  # values without it, from which the rival is fitted
     terms: tuple[str, ...]  # effects that may leave their tolerances under the rival, itself included
     spread: float  # standard deviation of the truth's size, as a share of it
-    same: float  # mean difference of log chi2 that counts as none (``significance.same``)
+    # mean difference of log chi2 that counts as none (``significance.same``); without a rival ``screen.shows`` decides
+    same: float
 
     @property
     def name(self) -> str:
@@ -119,8 +121,15 @@ class Evaluator:
         episode = measured.windows.episode[windows]
         return Evidence(table.grams(measured), measured.size[windows], signal, weight, episode)
 
+    @property
+    def known(self) -> tuple[Evidence, ...]:
+        """What the recordings at hand say of the pair: nothing of an effect that they do not excite."""
+        return (self.at_hand,) if self.pair.rival else ()
+
     def worth(self, *parts: Evidence) -> Worth:
         """Return how well recordings separate the pair, all of ``parts`` together."""
+        if not parts:
+            return Worth(0.0, 0.0, 0.0, 0.0)
         state, layout = self.state, self.layout
         totals = [(part.weight, layout.total(part.grams)) for part in parts]
         matrix = sum(weight * total[0] for weight, total in totals)
@@ -137,6 +146,8 @@ class Evaluator:
             energy += part.weight * float(part.signal.sum())
         pair = self.pair
         chance = power(distance, gain / values, pair.same, values, pair.spread, self.alpha)
+        if not (pair.rival or shows(max(float((part.signal / part.size[:, None]).max()) for part in parts))):
+            chance = 0.0
         return Worth(distance, 1.0 - distance / max(energy, distance, 1e-12), gain / values, chance)
 
 
@@ -163,7 +174,7 @@ class Choice:
     """What a search for a design came to."""
 
     best: Rehearsal | None  # the design; None if no pair is distinguishable
-    worths: tuple[Worth, ...]  # of the recordings at hand and the best design together, pair by pair
+    worths: tuple[Worth, ...]  # of what is known and the best design together, pair by pair
     reach: tuple[Worth, ...]  # largest power that any design reached, pair by pair
     tried: int  # designs that were looked at
     beyond: int  # designs that were left out since they go beyond a limit
@@ -176,7 +187,7 @@ class _Search:
         self.stage, self.evaluators = stage, evaluators
         self.dt = stage.comparison.dt  # of what is held against limits
         self.tried = self.beyond = 0
-        self.reach = [evaluator.worth(evaluator.at_hand) for evaluator in evaluators]
+        self.reach = [evaluator.worth(*evaluator.known) for evaluator in evaluators]
 
     def within_limits(self, designs: Sequence[Design]) -> list[Rehearsal]:
         """Return the designs that stay within the limits, as the model plays them."""
@@ -199,7 +210,7 @@ class _Search:
                 for evaluator, evidence in zip(self.evaluators, evidences, strict=True):
                     count = int((evidence.episode == number).sum())
                     evidence_of_one = [evidence.one(number, max(whole / count, 1.0))] if count else []
-                    worths.append(evaluator.worth(evaluator.at_hand, *evidence_of_one))
+                    worths.append(evaluator.worth(*evaluator.known, *evidence_of_one))
                 results.append(tuple(worths))
         return results
 

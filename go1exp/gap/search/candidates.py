@@ -115,14 +115,14 @@ def absorbed(
     ]
 
 
-def unexcited_rows(signal: Mapping[str, float], threshold: float, tested: Sequence[str]) -> list[Candidate]:
+def unexcited_rows(unexcited: Sequence[str], tested: Sequence[str]) -> list[Candidate]:
     """Return rows for the effects that the data cannot show."""
     return [
         Candidate(
             effect, (), {}, math.nan, 0.0, 1.0, 0.0, (effect,), "not excited", "twice its tolerance would not show"
         )
-        for effect, level in signal.items()
-        if level < threshold and effect not in tested
+        for effect in unexcited
+        if effect not in tested
     ]
 
 

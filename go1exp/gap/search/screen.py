@@ -17,6 +17,8 @@ from go1exp.gap.search import thresholds, tolerances
 from go1exp.sim.effects.base import Identification, Periodic
 from go1exp.sim.effects.tolerances import Tolerances, sizes
 
+BEYOND = 1.5  # times a probe of twice the tolerance: a larger change may not be scaled down to that
+
 
 @dataclass(frozen=True)
 class Variant:
@@ -126,6 +128,10 @@ def _levels(machine: Machine, effect: str, how: Identification, moved: Motion) -
                 change = np.zeros(len(machine.joints))
                 change[part] = np.clip(share * largest, limit.low, limit.null - limit.tolerance) - limit.null
                 levels.append({how.limits_torque: change})
+    wide = {key[1]: thresholds.PROBE * machine.tolerances.param(key).tolerance for key in sizes(effect)}
+    within = [np.abs(change).max() <= BEYOND * wide[name] for level in levels for name, change in level.items()]
+    if within and not any(within) and not how.nominal:
+        levels.append({})  # narrow tolerances of the user's: what twice their width would show is measured, too
     for law, chosen in product(how.laws or ({},), how.shapes or ({},)):
         shapes: Theta = {(effect, name): moved.angle(value) for name, value in {**law, **chosen}.items()}
         for level in levels or [{}]:
@@ -217,6 +223,14 @@ class _Ranking:
         return Screened(variant, start, gain, relief, signal)
 
 
+def shows(level: float) -> bool:
+    """Return whether recordings excite an effect, by the chi2 that twice its tolerance adds to their best window.
+
+    The only such law: of the answer for the logs at hand, and of ``gap next`` for the recordings that it designs.
+    """
+    return level >= thresholds.NOT_EXCITED
+
+
 def outside(screened: Sequence[Screened], within: Collection[str]) -> list[Screened]:
     """Return the effects to try if one that has no tolerance to move in would relieve the others most; none otherwise.
 
@@ -262,8 +276,8 @@ def _signal(
     for k in columns:
         key = probes[k].key
         assert isinstance(key, tuple)
-        reach = 2.0 * declared.param(key).tolerance
-        if np.abs(probes[k].delta).max() <= 1.5 * reach:  # beyond, a threshold may lie between
+        reach = thresholds.PROBE * declared.param(key).tolerance
+        if np.abs(probes[k].delta).max() <= BEYOND * reach:  # beyond, a threshold may lie between
             most = max(most, float((grams[..., k, k] / size).max()) * reach**2)
     return most
 

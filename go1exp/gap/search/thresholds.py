@@ -32,7 +32,7 @@ CONVERGED_SHARE = 0.01  # the same as a share of log chi2: beside a large error 
 GOOD_FIT = 0.01  # log chi2 below which a model without terms needs no more rounds
 STEPS_PER_ROUND = 2  # most Gauss-Newton steps before the Jacobian is measured again
 FINER_STEPS = 4  # substeps of a physics step in the last fit: errors of 1 ms steps can look like 0.4 ms of delay
-NOT_EXCITED = 0.02  # chi2 added in every window, at twice its tolerance, below which an effect is not excited
+NOT_EXCITED = 0.02  # chi2 per value that twice its tolerance must add to some window, or an effect is not excited
 SCREENED_WINDOWS = 20  # most windows of the screening
 # Most rounds of fitting of a rival of an effect at its bound, which begins at a small part of its size.
 RIVAL_ROUNDS = 4

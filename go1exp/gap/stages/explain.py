@@ -134,8 +134,8 @@ def searched(comparison: Comparison, rng: np.random.Generator, warnings: list[st
     settings, parts = comparison.settings, comparison.split(rng)
     if parts.alone:
         warnings.append(
-            f"Of {len(parts.alone)} episodes there is no other with the same motion and gains; stretches of them test "
-            "what was fitted on the rest of them."
+            f"Of {counted(len(parts.alone), 'episode')} there is no other with the same motion and gains; stretches "
+            "of them test what was fitted on the rest of them."
         )
     if parts.shared:
         warnings.append(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from itertools import chain
 from typing import Any
 
@@ -20,6 +20,7 @@ from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import Candidate, GapResult, GapSettings, NamedEffect
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.search import significance, thresholds, tolerances
+from go1exp.gap.search.screen import Motion, library, motion
 from go1exp.gap.stages.apply import composed, read_as, terms_of, theta_of
 from go1exp.logs.record.simulate import held_quat
 from go1exp.logs.recording import Recording
@@ -44,7 +45,8 @@ class Verdict:
     def text(self) -> str:
         """In a line."""
         what = f"{self.truth} from {self.rival}" if self.rival else f"whether there is {self.truth}"
-        line = f"{what}: {self.before.power:.0%} with the logs at hand"
+        known = f"{self.before.power:.0%} with" if self.rival else "not excited by"
+        line = f"{what}: {known} the logs at hand"
         return f"{line}; not separable: {self.reason}" if self.reason else f"{line}, {self.after.power:.0%} with this"
 
 
@@ -60,6 +62,7 @@ class NextResult:
     joints: tuple[str, ...]  # their names
     tried: int = 0  # designs that were looked at
     beyond: int = 0  # designs that went beyond a limit
+    standing: Mapping[str, str] = field(default_factory=dict)  # effects that only feet show -> excitation that would
 
     @property
     def seconds(self) -> float:
@@ -75,7 +78,8 @@ class NextResult:
             design["seconds"] = self.seconds
         pairs = [{**asdict(p), "separable": not p.reason} for p in self.pairs]
         about = {"rate_hz": self.rate_hz, "joints": list(self.joints), "tried": self.tried, "beyond": self.beyond}
-        return {"verdict": self.verdict, "design": design, "pairs": pairs, "settled": [*self.distinguishable], **about}
+        about |= {"settled": [*self.distinguishable], "standing": dict(self.standing)}
+        return {"verdict": self.verdict, "design": design, "pairs": pairs, **about}
 
 
 def model_of(result: GapResult, robot: Robot) -> Theta:
@@ -119,11 +123,12 @@ def pairs_of(result: GapResult, robot: Robot) -> list[Pair]:
     return listed
 
 
-def unseen(result: GapResult, robot: Robot) -> list[Pair]:
-    """Return what the recordings did not excite, each against nothing."""
+def unseen(result: GapResult, robot: Robot, moved: Motion) -> list[Pair]:
+    """Return what the answer calls not excited and this robot can feel, each against nothing."""
     theta, terms = model_of(result, robot), tuple(n.effect for n in result.named)
+    shapes = {v.effect: v.shapes for v in reversed(library(robot, moved))}
     return [
-        Pair(effect, "", _probed(effect, theta, robot), theta, terms, 0.0, thresholds.SAME_GAIN)
+        Pair(effect, "", _probed(effect, theta | shapes.get(effect, {}), robot), theta, terms, 0.0, 0.0)
         for effect in result.not_excited
         if effect in tolerances.felt(robot)
     ]
@@ -156,9 +161,9 @@ def _fitted(effect: str, candidates: Sequence[Candidate], robot: Robot) -> Theta
 
 
 def _probed(effect: str, theta: Theta, robot: Robot) -> Theta:
-    """Return values with an effect at all joints, as large as what must not go unseen: twice its tolerance."""
+    """Return values with an effect at all joints, as large as what must not go unseen: twice its tolerances."""
     changed = dict(theta)
-    for key in sizes(effect)[:1]:
+    for key in sizes(effect):
         p = robot.tolerances.param(key)
         wide = len(robot.joints) if p.per == "joint" else 1
         changed[key] = np.full(wide, p.null + tolerances.step(p, None, thresholds.PROBE))
@@ -204,10 +209,11 @@ def design(
     """
     robot = read_as(robot_from(robot), result).suited(recordings)
     _same_logs(result, recordings)
-    lots = [pairs_of(result, robot), [] if names_only else unseen(result, robot)]
+    pairs, unexcited = pairs_of(result, robot), {} if names_only else result.not_excited
+    standing = {effect: how for effect, how in unexcited.items() if effect not in tolerances.felt(robot)}
     rate = recordings[0].meta.rate_hz
-    if not any(lots):
-        return NextResult("nothing left", (), (), None, rate, robot.joints)
+    if not pairs and len(standing) == len(unexcited):
+        return NextResult("nothing left", (), (), None, rate, robot.joints, standing=standing)
     with one_thread():
         comparison = compare(recordings, robot, search, on_progress)
         targets = [r.joint("q_target") for r in comparison.recordings]
@@ -216,21 +222,21 @@ def design(
             raise DesignError("gap next designs motions of drives that follow angles; these are commanded torques")
         on_progress("what the recordings at hand separate", 0.1)
         distinguishable: list[str] = []
-        for pairs in lots:  # names first: what was not excited waits until they are distinguishable
-            evaluators, before = _left(pairs, comparison, result, distinguishable)
-            if evaluators:
-                break
-        else:
-            return NextResult("nothing left", (), tuple(distinguishable), None, rate, robot.joints)
+        evaluators, before = _left(pairs, comparison, result, distinguishable)
+        if not evaluators and unexcited:  # which waits until the names are distinguishable
+            others = unseen(result, robot, motion(comparison.windows, robot.effort))
+            evaluators, before = _left(others, comparison, result, distinguishable)
+        if not evaluators:
+            known = tuple(distinguishable)
+            return NextResult("nothing left", (), known, None, rate, robot.joints, standing=standing)
         stage = Stage(comparison, limits, model_of(result, robot), settings.seconds)
         rate = 1.0 / stage.period
         choice = choose(stage, evaluators, attitudes(robot, comparison, settings), settings, on_progress)
     on_progress("done", 1.0)
     verdicts = _verdicts(evaluators, before, choice, settings)
     verdict = "designed" if choice.best else "not separable"
-    return NextResult(
-        verdict, verdicts, tuple(distinguishable), choice.best, rate, robot.joints, choice.tried, choice.beyond
-    )
+    known, tried = tuple(distinguishable), (choice.tried, choice.beyond)
+    return NextResult(verdict, verdicts, known, choice.best, rate, robot.joints, *tried, standing)
 
 
 def _left(
@@ -240,7 +246,7 @@ def _left(
     evaluators, before = list[Evaluator](), list[Worth]()
     for pair in pairs:
         evaluator = Evaluator(pair, comparison.scorer, comparison.settings, COARSE * comparison.dt)
-        worth = evaluator.worth(evaluator.at_hand)
+        worth = evaluator.worth(*evaluator.known)
         equal = any(n.effect == pair.truth and pair.rival in n.alias_set for n in result.named)  # in the search
         if worth.power < ENOUGH or equal:
             evaluators.append(evaluator)
