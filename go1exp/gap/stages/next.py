@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from go1exp.base.tensors.threads import one_thread
+from go1exp.base.wording import counted
 from go1exp.gap.comparison import Comparison, Progress, compare, robot_from
 from go1exp.gap.data.prepare import fingerprint
 from go1exp.gap.design.choice import COARSE, ENOUGH, Choice, Evaluator, Pair, Worth, choose
@@ -188,7 +189,7 @@ def reason(evaluator: Evaluator, reached: Worth, choice_beyond: int, settings: D
         why = f"twice its tolerance changes chi2 by {reached.gain:.2g} per value there"
     fixed = [name for name, kept in (("gains", settings.gains), ("hang", settings.hang)) if len(kept) == 1]
     hints = [f"{' and '.join(fixed)} may not change"] if fixed else []
-    hints += [f"{choice_beyond} designs went beyond a limit"] if choice_beyond else []
+    hints += [f"{counted(choice_beyond, 'design')} went beyond a limit"] if choice_beyond else []
     return "; ".join([best, why, *hints])
 
 
