@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from go1exp.cli.record import AUDIT
 from go1exp.config.schema import registry
 from go1exp.logs import excitations
-from go1exp.logs.audit import AuditReport, audit, audit_file, clock_flaws, signals
+from go1exp.logs.audit import AuditReport, audit, audit_file, clock_flaws, clock_kinds, signals
 from go1exp.logs.audit.copies import copies
 from go1exp.logs.audit.impossible import impossible, without
 from go1exp.logs.audit.signals import Log
@@ -651,6 +651,26 @@ def test_audit_of_a_folder_tells_of_clocks_apart(tmp_path: Path, capsys: pytest.
     assert AUDIT.run([f"files=[{tmp_path}]", f"out={out}"]) == 4
     assert [Path(file).stem for file, report in json.loads(out.read_text()).items() if "clocks" in report] == ["e2"]
     assert "e2.parquet: bad beside the others: joints answer their commands after -4" in capsys.readouterr().out
+
+
+def test_audit_of_two_folders_takes_their_clocks_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As gap does; each file has its own figure, and folders of other rates are named with them."""
+    for k, recording in enumerate(shifted(0, 0, 20, 20)):
+        write(tmp_path / ("day1" if k < 2 else "day2") / f"run_{k % 2}.parquet", recording)
+    pair = f"files=[{tmp_path / 'day1'},{tmp_path / 'day2'}]"
+    assert AUDIT.run([pair]) == 4
+    said = [line for line in capsys.readouterr().out.splitlines() if "bad beside the others" in line]
+    assert [re.search(r"commands after (-?\d+)", line)[1] for line in said] == ["-0", "-0", "-40", "-40"]
+
+
+def test_logs_of_different_clocks_are_named_with_their_rates() -> None:
+    r = made("steps")
+    slow = replace(r, channels={name: values[::2] for name, values in r.channels.items()})
+    late = with_(r, t=r.t + 1.7e9)
+    reports = [replace(audit(x), episode=name) for x, name in ((r, "a"), (slow, "b"), (r, "c"), (late, "d"))]
+    said = clock_kinds(reports)
+    assert re.match(r"The logs have different clocks: a, c: \S+ Hz, [^;]*; b: \S+ Hz, [^;]*; d: .* since 1970\.$", said)
+    assert clock_kinds([reports[0], reports[2]]) == ""
 
 
 # ---------------------------------------------------------------------- the report

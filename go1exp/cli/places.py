@@ -158,6 +158,12 @@ def read_all(places: str | Sequence[str]) -> list[Recording]:
     return renamed
 
 
+def names_of(files: Sequence[Path]) -> list[str]:
+    """Return a name for each file: its stem, after the end of its folder's path where there are several folders."""
+    folders = _apart([path.resolve().parent for path in files])
+    return [f.stem if len({*folders}) == 1 else f"{folder}/{f.stem}" for f, folder in zip(files, folders, strict=True)]
+
+
 def _apart(folders: list[Path]) -> list[str]:
     """Return the shortest ends of the paths by which the folders differ."""
     parts = next(n for n in count(1) if len({f.parts[-n:] for f in folders}) == len({*folders}))

@@ -13,9 +13,9 @@ from pydantic import Field
 
 from go1exp.base import errors
 from go1exp.base.files import write_json
-from go1exp.base.wording import counted
+from go1exp.base.wording import counted, listed
 from go1exp.cli.app import App, parse, parse_with_groups, spinner
-from go1exp.cli.places import files_of, trained, writable
+from go1exp.cli.places import files_of, names_of, trained, writable
 from go1exp.cli.verbs import command
 from go1exp.config.compose import compose
 from go1exp.config.schema import settings as schema
@@ -244,35 +244,40 @@ def _audit(container: dict[str, Any]) -> int:
 
     settings = parse(AuditSettings, container)
 
-    from go1exp.logs.audit import AuditReport, audit_file, clock_flaws
+    from go1exp.logs.audit import AuditReport, audit, clock_flaws, clock_kinds
+    from go1exp.logs.recording import read
 
     reports: dict[str, Any] = {}
-    folders: dict[Path, dict[Path, AuditReport]] = {}
+    robots: dict[str, dict[Path, AuditReport]] = {}
     unreadable: list[RecordingError] = []
     status = 0
     files = files_of(settings.files)
+    names = dict(zip(files, names_of(files), strict=True))
     for file in files:
         try:
-            report = audit_file(file)
+            recording = read(file)
         except RecordingError as error:
             unreadable.append(error)
             reports[str(file)] = {"verdict": "unreadable", "message": str(error)}
             continue
+        report = audit(recording)
         print(
             f"{file}\n{report.text()}\n"
             if settings.tables or len(files) == 1 or report.verdict != "ok"
-            else f"{file}: ok"
+            else f"{file}: ok by itself"
         )
         reports[str(file)] = report.as_dict()
-        folders.setdefault(file.parent, {})[file] = report
+        robots.setdefault(recording.meta.robot, {})[file] = replace(report, episode=names[file])
         status = max(status, errors.AUDIT[report.verdict])
-    for together in folders.values():
-        flaws = clock_flaws([replace(report, episode=file.stem) for file, report in together.items()])
+    for together in robots.values():  # those of one robot, as ``gap`` compares them
+        flaws = clock_flaws([*together.values()])
         for file in together:
-            if file.stem in flaws:
-                print(f"{file}: bad beside the others: {flaws[file.stem]}")
-                reports[str(file)] |= {"verdict": "bad", "clocks": flaws[file.stem]}
+            if flaw := flaws.get(names[file]):
+                print(f"{file}: bad beside the others: {flaw}")
+                reports[str(file)] |= {"verdict": "bad", "clocks": flaw}
                 status = max(status, errors.AUDIT["bad"])
+        if kinds := clock_kinds([*together.values()]):
+            print(f"note: {kinds}")
     if settings.out:
         out = Path(settings.out)
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -289,7 +294,6 @@ def _audit(container: dict[str, Any]) -> int:
 AUDIT = App("record_audit", _audit, AuditSettings)
 
 
-NAMED = 3  # most files that a note names
 MOST_NOTES = 10  # most notes of recordings that an import prints
 
 
@@ -310,7 +314,7 @@ def _import(container: dict[str, Any]) -> None:
     out = writable(settings.out)
     names = [f"{r.meta.episode}.parquet" for r in recordings]
     if present := [name for name in names if (out / name).exists()]:
-        print(f"note: {out} holds {_listed(present)} of an earlier call; new ones replace them (or: out=FOLDER)")
+        print(f"note: {out} holds {listed(present)} of an earlier call; new ones replace them (or: out=FOLDER)")
     _write(out, recordings)
     notes = list(dict.fromkeys(r.meta.notes for r in recordings if r.meta.notes))
     for note in [*_wrong_steps(recordings), *notes[:MOST_NOTES]]:
@@ -332,7 +336,7 @@ def _wrong_steps(recordings: Sequence[Recording]) -> list[str]:
             if unit := _unit_of(message, log.dt < LEAST_STEP):
                 message += f"; with source=csv, columns gives the unit: t: {{column: NAME, unit: {unit}}}"
             flaws.setdefault(f"t {message}", []).append(r.meta.episode)
-    return [f"{_listed(episodes)}: {message}" for message, episodes in flaws.items()]
+    return [f"{listed(episodes)}: {message}" for message, episodes in flaws.items()]
 
 
 def _unit_of(message: str, short: bool) -> str | None:
@@ -341,12 +345,6 @@ def _unit_of(message: str, short: bool) -> str | None:
         (unit for name, unit in (("millis", "ms"), ("micros", "us"), ("nanos", "ns")) if name in message), None
     )
     return "s" if short else named
-
-
-def _listed(names: Sequence[str]) -> str:
-    """Return the first names, and how many more there are."""
-    rest = len(names) - NAMED
-    return ", ".join(names[:NAMED]) + (f" and {rest} more" if rest > 0 else "")
 
 
 IMPORT = App("record_import", _import, ImportSettings)

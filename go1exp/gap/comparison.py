@@ -20,7 +20,7 @@ from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score.initial_state import measured, repeatability
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.search.clocks import OF_CLOCK, Contestant, contest, details, rows_of, same_rows
-from go1exp.logs.audit import AuditReport, audit, clock_flaws
+from go1exp.logs.audit import AuditReport, audit, clock_flaws, clock_kinds
 from go1exp.logs.audit.impossible import without
 from go1exp.logs.recording import Recording, RecordingError
 from go1exp.robot.config import RobotConfig
@@ -120,8 +120,8 @@ def prepare(recordings: Sequence[Recording], robot: Robot, settings: GapSettings
         settings = replace(settings, torque=False)
         removed.append(f"tau_est: {copied[0].channel} {copied[0].message}")
     ready = robot.prepared([recordings[k] for k in good], kept, settings)
-    omitted = (f"Left out: {line}." for line in (*removed, *lines))
-    return robot, replace(ready, warnings=(*omitted, *ready.warnings), impossible=left_out)
+    notes = [*(f"Left out: {line}." for line in (*removed, *lines)), *filter(None, [clock_kinds(kept)])]
+    return robot, replace(ready, warnings=(*notes, *ready.warnings), impossible=left_out)
 
 
 def _without_impossible_rows(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.signal import savgol_filter
 
-from go1exp.base.wording import counted
+from go1exp.base.wording import counted, listed
 from go1exp.config.schema.physics import MUJOCO_CONTACT, ContactConfig, contact_text
 from go1exp.config.schema.registry import ConfigError
 from go1exp.gap.result import GapResult, GapSettings
@@ -89,7 +89,6 @@ def spaced(recordings: Sequence[Recording], settings: GapSettings, joints: int) 
     return dataclasses.replace(settings, stride_s=stride), [warning]
 
 
-SHOWN = 3  # recordings of one contact that a message lists
 CHOOSE = "contact=stiff (conf/contact, docs/contact.md)"  # how one is chosen
 
 
@@ -111,7 +110,7 @@ def contact_of(recordings: Sequence[Recording], chosen: ContactConfig | None) ->
         if recording.meta.contact is not None:
             by_contact.setdefault(recording.meta.contact, []).append(recording.meta.episode)
     if len(by_contact) > 1:
-        each = "; ".join(f"{_listed(names)}: {contact_text(contact)}" for contact, names in by_contact.items())
+        each = "; ".join(f"{listed(names)}: {contact_text(contact)}" for contact, names in by_contact.items())
         raise ConfigError(
             [
                 f"logs: recordings on the ground name different contacts of the feet ({each}), and a model has one; "
@@ -121,24 +120,19 @@ def contact_of(recordings: Sequence[Recording], chosen: ContactConfig | None) ->
     return next(iter(by_contact), MUJOCO_CONTACT)
 
 
-def _listed(names: Sequence[str]) -> str:
-    rest = len(names) - SHOWN
-    return ", ".join(names[:SHOWN]) + (f" and {rest} more" if rest > 0 else "")
-
-
 def contact_warnings(recordings: Sequence[Recording], contact: ContactConfig) -> list[str]:
     """Return what a reader must know of the contact that the model has, a sentence each."""
     standing = on_feet(recordings)
     others = [r.meta.episode for r in standing if r.meta.contact not in (None, contact)]
     if others:
-        return [f"The feet have the contact that was chosen, {contact_text(contact)}; {_listed(others)} name another."]
+        return [f"The feet have the contact that was chosen, {contact_text(contact)}; {listed(others)} name another."]
     unnamed = [r.meta.episode for r in standing if r.meta.contact is None]
     if not unnamed:
         return []
     if len(unnamed) == len(standing):
         return [f"No recording names a contact of the feet; the model has {contact_text(contact)}. Another: {CHOOSE}."]
     return [
-        f"{counted(len(unnamed), 'recording')} of {len(standing)} without a contact of the feet ({_listed(unnamed)}) "
+        f"{counted(len(unnamed), 'recording')} of {len(standing)} without a contact of the feet ({listed(unnamed)}) "
         f"are taken to have that of the others, {contact_text(contact)}."
     ]
 

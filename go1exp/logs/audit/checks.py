@@ -13,6 +13,7 @@ import go1exp.logs.audit.limits as limits
 import go1exp.logs.audit.related as related
 import go1exp.logs.audit.signals as signals
 import go1exp.logs.audit.single as single
+from go1exp.base.wording import listed
 from go1exp.logs.audit.commands import Delay
 from go1exp.logs.audit.copies import copies
 from go1exp.logs.audit.impossible import impossible, without
@@ -161,9 +162,14 @@ class CommandDelay:
     time: float
     error: float
 
+    @property
+    def measured(self) -> str:
+        """In words."""
+        return f"{1e3 * self.time:.1f} ± {1e3 * self.error:.1f} ms"
+
     def __str__(self) -> str:
-        """Return it in words."""
-        return f"{1e3 * self.time:.1f} ± {1e3 * self.error:.1f} ms ({self.episode})"
+        """Return it with the recording, in words."""
+        return f"{self.measured} ({self.episode})"
 
     def differs_from(self, other: CommandDelay) -> bool:
         """Return whether two recordings differ by more than one robot's can."""
@@ -207,4 +213,53 @@ def clock_flaws(reports: Sequence[AuditReport]) -> dict[str, str]:
         return {one.episode: f"joints answer their commands after {one}, {usual}: {why}" for one in apart}
     ordered = sorted(known, key=lambda one: one.time)
     ends = " to ".join(str(one) for one in dict.fromkeys((ordered[0], ordered[-1])))
-    return {report.episode: f"joints answer their commands after {ends}: {why}" for report in reports}
+    own = {one.episode: f"after {one.measured}" for one in known}
+    each = {report.episode: own.get(report.episode, "after an unknown time") for report in reports}
+    return {
+        name: f"joints answer their commands {time}, in these logs after {ends}: {why}" for name, time in each.items()
+    }
+
+
+EPOCH_S = 1e8  # times beyond which are counted since 1970 (chosen: three years)
+SAME_RATE = 1.02  # ratio of two rates up to which they are one (chosen)
+SAME_JITTER = 3.0  # the same of the jitter, as a share of a step (chosen)
+LITTLE_JITTER = 0.01  # share of a step below which jitter is alike (chosen)
+
+
+@dataclass(frozen=True)
+class _Clock:
+    """How a recording is stamped."""
+
+    rate_hz: float
+    jitter: float  # share of a step; 0 if steps were counted
+    since_1970: bool
+
+    def __str__(self) -> str:
+        """Return it in words."""
+        steps = f"steps vary by {self.jitter:.1%}" if self.jitter else "counted steps"
+        return f"{self.rate_hz:.4g} Hz, {steps}" + (", seconds since 1970" if self.since_1970 else "")
+
+    def like(self, other: _Clock) -> bool:
+        """Return whether two recordings may be of one logger."""
+        few, many = (f(max(one.jitter, LITTLE_JITTER) for one in (self, other)) for f in (min, max))
+        alike = (bool(self.jitter), self.since_1970) == (bool(other.jitter), other.since_1970)
+        slow, fast = sorted((self.rate_hz, other.rate_hz))
+        return alike and fast <= SAME_RATE * slow and many <= SAME_JITTER * few
+
+
+def clock_kinds(reports: Sequence[AuditReport]) -> str:
+    """Return which clock each recording has: rate, jitter and origin; empty if all have one of a kind."""
+    kinds: list[tuple[_Clock, list[str]]] = []
+    for report in reports:
+        size = next((f.size for f in report.by_check("jitter")), None)
+        if size is None or not report.channels:
+            continue  # no clock to speak of: the audit has said so
+        share = size * 1e-3 * report.rate_hz
+        clock = _Clock(report.rate_hz, share if share >= limits.COUNTED else 0.0, report.channels[0].low > EPOCH_S)
+        names = next((names for kind, names in kinds if kind.like(clock)), None)
+        if names is None:
+            kinds.append((clock, names := []))
+        names.append(report.episode)
+    if len(kinds) < 2:
+        return ""
+    return "The logs have different clocks: " + "; ".join(f"{listed(n)}: {kind}" for kind, n in kinds) + "."

@@ -15,6 +15,7 @@ from go1exp.robot.go1_fields import TORQUE_STEP
 RATE = (0.02, 0.10)  # relative distance of the median step from 1 / ``rate_hz``: 2 % shifts a 20 s chirp by 0.4 s
 JITTER = (0.10, 0.50)
 """Standard deviation of the steps over their median: a tenth of 2 ms is the encoder noise of a joint at 2 rad/s."""
+COUNTED = 1e-6  # the same below which a clock was counted, not read
 GAP_STEPS = 1.8
 """A step longer than this many medians (and 6 robust deviations more than one) is a gap: a sample is missing."""
 GAPS = (0.0, 0.02)

@@ -81,7 +81,7 @@ def clock(log: Log) -> Iterator[Finding]:
         f"steps vary by {jitter * 1e3:.3g} ms (standard deviation; {jitter / log.dt:.1%}), at most {worst * 1e3:.3g} ms"
     )
     # A measured clock is never exact; one without any jitter is a row counter times the nominal period.
-    if jitter < 1e-6 * log.dt and log.recording.meta.source == "measured":
+    if jitter < limits.COUNTED * log.dt and log.recording.meta.source == "measured":
         message += "; a clock this even was counted, not read, so its true jitter is unknown"
     yield finding("jitter", "t", graded(jitter / log.dt, limits.JITTER), jitter * 1e3, "ms", message)
     if long.any():
