@@ -660,7 +660,7 @@ def test_audit_of_two_folders_takes_their_clocks_together(tmp_path: Path, capsys
     pair = f"files=[{tmp_path / 'day1'},{tmp_path / 'day2'}]"
     assert AUDIT.run([pair]) == 4
     said = [line for line in capsys.readouterr().out.splitlines() if "bad beside the others" in line]
-    assert [re.search(r"commands after (-?\d+)", line)[1] for line in said] == ["-0", "-0", "-40", "-40"]
+    assert [re.findall(r"commands after (-?\d+)", line)[0] for line in said] == ["-0", "-0", "-40", "-40"]
 
 
 def test_logs_of_different_clocks_are_named_with_their_rates() -> None:
