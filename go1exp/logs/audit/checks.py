@@ -213,8 +213,8 @@ def clock_flaws(reports: Sequence[AuditReport]) -> dict[str, str]:
         return {one.episode: f"joints answer their commands after {one}, {usual}: {why}" for one in apart}
     ordered = sorted(known, key=lambda one: one.time)
     ends = " to ".join(str(one) for one in dict.fromkeys((ordered[0], ordered[-1])))
-    own = {one.episode: f"after {one.measured}" for one in known}
-    each = {report.episode: own.get(report.episode, "after an unknown time") for report in reports}
+    measured = {one.episode: f"after {one.measured}" for one in known}
+    each = {report.episode: measured.get(report.episode, "after an unknown time") for report in reports}
     return {
         name: f"joints answer their commands {time}, in these logs after {ends}: {why}" for name, time in each.items()
     }
