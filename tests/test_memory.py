@@ -216,9 +216,9 @@ def test_a_report_asks_no_run_for_what_does_not_fit(
     show = lambda number, count, label: lambda done, total: None  # noqa: E731
     settings: Any = None
     with pytest.raises(TooLongError, match=r"^evaluation\.seconds = "):
-        evaluating.evaluate_missing([evaluating.Wanted(run, None)], settings, show)
+        evaluating.evaluate_missing([(run, None)], settings, show)
     with pytest.raises(TooLongError, match=r"^seconds = "):
-        evaluating.evaluate_missing([evaluating.Wanted(run, one("gait"))], settings, show)
+        evaluating.evaluate_missing([(run, one("gait"))], settings, show)
 
 
 # ---------------------------------------------------------------------- too short, or without end

@@ -177,7 +177,7 @@ def test_a_better_subject_is_called_better_and_a_worse_one_worse(result: Callabl
     assert (d.verdict, d.difference.n) == ("better", 3)
     assert d.difference.estimate == pytest.approx(-0.1, abs=1e-3)
     assert found["rmse_x", (1.0, 0.0, 0.0)].difference.n == 2
-    assert found["rmse_x", (1.0, 0.0, 0.0)].word == "no significant difference"
+    assert found["rmse_x", (1.0, 0.0, 0.0)].verdict == "no significant difference"
 
 
 # ---------------------------------------------------------------------- the stage
