@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from go1exp import robot
-from go1exp.base.errors import Expected
 from go1exp.config.compose import compose
+from go1exp.config.schema.registry import ConfigError
 from go1exp.deploy.runtime import go1_wire
 from go1exp.deploy.sim_robot import SimConfig
 from go1exp.deploy.sim_robot.machine import TICK, Body, Robot
@@ -266,7 +266,7 @@ def test_of_each_group_the_longest_interval_is_drawn() -> None:
 def test_the_robot_lives_in_a_process_of_its_own_and_ends_with_the_page(capfd: pytest.CaptureFixture[str]) -> None:
     groups = {name: CONTAINER[name] for name in GROUPS}
     process = RobotProcess(groups, (0, 0), SimConfig(), ("127.0.0.1", 0), None, SAY)
-    with pytest.raises(Expected, match=r"address = 127\.0\.0\.1:\d+: "):
+    with pytest.raises(ConfigError, match=r"address = 127\.0\.0\.1:\d+: "):
         RobotProcess(groups, (0, 0), SimConfig(), process.address, None, SAY)
     show = SimShow(process, Body(**PARTS))
     ends = time.perf_counter() + 20.0

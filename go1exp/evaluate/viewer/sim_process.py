@@ -225,8 +225,8 @@ class RobotProcess:
 
         ``groups`` are those of ``machine.Body`` as plain data, ``tile`` is the row and column where it begins, and
         ``seconds`` how long it runs, None until it is closed. ``say`` prints a line in the other process: an importable
-        function. Raise ConfigError if its settings are refused, and Expected if it cannot listen at ``address``, or
-        ends before.
+        function. Raise ConfigError if its settings or ``address`` are refused, and Expected if it ends before it
+        listens.
         """
         context = multiprocessing.get_context("spawn")
         self._pipe, other = context.Pipe()
