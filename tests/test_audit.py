@@ -21,11 +21,11 @@ from scipy.spatial.transform import Rotation
 from go1exp.cli.record import AUDIT
 from go1exp.config.schema import registry
 from go1exp.logs import excitations
-from go1exp.logs.audit import AuditReport, audit, audit_file, clock_flaws, clock_kinds, signals
+from go1exp.logs.audit import AuditReport, audit, clock_flaws, clock_kinds, signals
 from go1exp.logs.audit.copies import copies
 from go1exp.logs.audit.impossible import impossible, without
 from go1exp.logs.audit.signals import Log
-from go1exp.logs.recording import Recording, RecordingError, joint_channels, write
+from go1exp.logs.recording import Recording, joint_channels, write
 from go1exp.robot import EFFORT_LIMIT, JOINT_POS_LIMITS, JOINTS, NOMINAL_STANCE, per_joint, soft_limits
 from tests.made import at, real
 from tests.made import meta as made_meta
@@ -709,13 +709,6 @@ def test_what_breaks_the_format_is_reported_not_raised() -> None:
     for broken in ({}, {"t": np.zeros(0)}, {"t": np.zeros((2, 2))}):
         assert audit(Recording(META, broken)).verdict == "bad"
         assert audit(Recording(META, broken)).text()
-
-
-def test_a_file_is_audited_as_its_recording(tmp_path: Path) -> None:
-    write(tmp_path / "a.parquet", made())
-    assert audit_file(tmp_path / "a.parquet").as_dict() == audit(made()).as_dict()
-    with pytest.raises(RecordingError, match="no such file"):
-        audit_file(tmp_path / "b.parquet")
 
 
 @pytest.mark.parametrize("length", [20, 49, 60, 120, 400, 1100, 2000])

@@ -263,9 +263,12 @@ def test_of_each_group_the_longest_interval_is_drawn() -> None:
 
 
 @pytest.mark.slow("go1exp/evaluate/viewer/", "go1exp/deploy/sim_robot/", "go1exp/cli/play_web.py")
-def test_the_robot_lives_in_a_process_of_its_own_and_ends_with_the_page(capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_robot_lives_in_a_process_of_its_own_and_ends_with_the_page(
+    capfd: pytest.CaptureFixture[str], request: pytest.FixtureRequest
+) -> None:
     groups = {name: CONTAINER[name] for name in GROUPS}
     process = RobotProcess(groups, (0, 0), SimConfig(), ("127.0.0.1", 0), None, SAY)
+    request.addfinalizer(process.close)  # a failed test must not leave it behind: pytest would wait for it
     with pytest.raises(ConfigError, match=r"address = 127\.0\.0\.1:\d+: "):
         RobotProcess(groups, (0, 0), SimConfig(), process.address, None, SAY)
     show = SimShow(process, Body(**PARTS))

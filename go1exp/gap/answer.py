@@ -31,9 +31,13 @@ def can_stand(robot: Robot) -> bool:
     return not (robot.on_ground or isinstance(robot, FixedBase))
 
 
+def _unexcited(signal: Mapping[str, float]) -> list[str]:
+    return [effect for effect, level in signal.items() if not shows(level)]
+
+
 def not_excited(signal: Mapping[str, float], held: bool = True) -> dict[str, str]:
     """Return effects that these data cannot show, and the excitation that would; ``held``: a trunk is that has feet."""
-    unexcited = [effect for effect, level in signal.items() if not shows(level)]
+    unexcited = _unexcited(signal)
     unfelt = [effect for effect in members("effect") if held and tolerances.identification(effect).needs_ground]
     return {effect: tolerances.identification(effect).excitation for effect in (*unexcited, *unfelt)}
 
@@ -240,8 +244,7 @@ def decide(search: Search, named: Sequence[NamedEffect], final: float, accepted:
 
 def evidence(search: Search) -> tuple[Candidate, ...]:
     """Return the candidates, best first, with those that the data cannot show."""
-    unexcited = [effect for effect, level in search.signal.items() if not shows(level)]
-    quiet = unexcited_rows(unexcited, [c.effect for c in search.candidates])
+    quiet = unexcited_rows(_unexcited(search.signal), [c.effect for c in search.candidates])
     accepted = {c.effect for c in search.candidates if c.status == "accepted"} - set(search.state.terms)
     kept = [
         replace(c, status="rejected", reason="dropped: the other terms do as well without it")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -19,14 +18,9 @@ from go1exp.logs.audit.copies import copies
 from go1exp.logs.audit.impossible import impossible, without
 from go1exp.logs.audit.report import ORDER, AuditReport, Channel, Finding, worst
 from go1exp.logs.audit.signals import Log, finding
-from go1exp.logs.recording import Recording, problems, read
+from go1exp.logs.recording import Recording, problems
 
 SHORTEST = 20  # fewest rows of a recording that are checked (chosen: a median step and its spread need about as many)
-
-
-def audit_file(path: Path) -> AuditReport:
-    """Read a recording and audit it; RecordingError if the file cannot be read or breaks the format."""
-    return audit(read(path))
 
 
 def audit(recording: Recording) -> AuditReport:
