@@ -14,7 +14,7 @@ import go1exp.logs.excitations
 import go1exp.logs.importers
 import go1exp.logs.record.motions  # noqa: F401  (registers every importer and excitation)
 from go1exp.base.paths import data_root
-from go1exp.cli import EVERY, SUBVERBS, VERBS
+from go1exp.cli import EVERY, SUBVERBS, VERBS, completion
 from go1exp.cli.app import app_of
 from go1exp.cli.completion import STAGES, WORDS, _importers, _listed, completions, serve
 from go1exp.cli.gap import GapVerb
@@ -35,7 +35,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (tmp_path / "runs" / run / "checkpoints").mkdir(parents=True)
         (tmp_path / "runs" / run / "config.yaml").touch()
     (tmp_path / "runs/flat/checkpoints/000400.pt").touch()
-    others = ("logs/walk.parquet", "gap/effect.yaml", "mine/reward/short.yaml", "mine/weather/wind.yaml", "walk.zip")
+    others = ("net.npz", "logs/walk.parquet", "gap/effect.yaml", "mine/reward/short.yaml", "mine/weather/wind.yaml", "walk.zip")
     for file in others:
         (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / file).write_text("a: 1\n")
@@ -52,6 +52,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("record au", {"audit"}),
         ("export ch", {"check", "checkpoint="}),
         ("export check fi", {"file="}),
+        ("export check w", {"walk.zip"}),
+        ("export check n", set()),
         ("record audit ou", {"out="}),
         ("record import opt", {"options="}),
         ("record import go2", {"go2_in_air"}),
@@ -77,12 +79,18 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("train --config-dir mi", {"mine/"}),
         ("train --help rew", {"reward"}),
         ("train resume=runs/f", {"resume=runs/flat"}),
-        ("train start_from=", {f"start_from={f}" for f in (*POLICIES, "gap/", "logs/", "mine/", "runs/")}),
+        ("train start_from=", {f"start_from={f}" for f in (*POLICIES, "runs/")}),
         ("train hydra/launcher=", {f"hydra/launcher={f}" for f in ("basic", "joblib", "ray", "slurm", "slurm_gpu")}),
         ("train hydra/l", {"hydra/launcher="}),
         ("train study=", {"study=ablations", "study=walking_cpu"}),
         ("train --he", {"--help"}),
-        ("eval run=r", {"run=runs/"}),
+        ("eval run=", {"run=runs/"}),
+        ("eval run=lo", set()),
+        ("eval run=runs/flat/", set()),
+        ("report r", {"runs/"}),
+        ("report folders=[runs/flat,", {"folders=[runs/flat,runs/"}),
+        ("compare runs/f", {"runs/flat"}),
+        ("train logger.dir=w", {"logger.dir=walk.zip"}),
         ("eval run=runs/", {"run=runs/flat", "run=runs/rough one"}),
         ("eval run=runs/flat checkpoint=0", {"checkpoint=000400.pt"}),
         ("eval policy=", {f"policy={name}" for name in POLICIES}),
@@ -118,8 +126,18 @@ def test_words_that_are_offered_are_words_that_exist() -> None:
         get_type_hints(kind, include_extras=False)
         for kind in (*filter(None, (app_of(verb).settings for verb in EVERY)), PPOConfig)
     ]
-    for key in ("viewer", "trunk_velocity", "suite", "what", "support", "share", "target", "schedule"):
+    for key in ("viewer", "trunk_velocity", "suite", "what", "support", "share", "target", "schedule", "robot"):
         assert {*WORDS[key]} in [{*get_args(hint[key])} for hint in hints if key in hint], key
+
+
+def test_a_folder_with_too_many_entries_to_look_at_is_offered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("large", "small"):
+        (tmp_path / name).mkdir()
+    for k in range(5):
+        (tmp_path / "large" / str(k)).touch()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(completion, "MANY", 4)
+    assert completions("go1exp eval run=") == ["run=large/"]
 
 
 def process(words: list[str], folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -179,4 +197,6 @@ printf '%s\\n' "${COMPREPLY[@]}"
 @pytest.mark.parametrize("action", ["install", "uninstall"])
 def test_completion_is_installed_and_taken_away(action: str, shell: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert serve(f"{action}={shell}") == 0
-    assert "go1exp" in capsys.readouterr().out
+    script = capsys.readouterr().out
+    assert "go1exp" in script
+    assert "default" not in script  # no shell adds files of its own where there is nothing to offer

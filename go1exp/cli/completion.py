@@ -23,24 +23,35 @@ OPTIONS = ("--help", "--cfg", "--multirun", "--config-dir", "--resolve", "--pack
 STAGES = ("check", "localise", "replay", "explain", "apply", "report", "view")
 """Words after ``gap``."""
 
-RUNS = ("run", "resume", "start_from")
+RUNS = ("run", "resume", "start_from", "folders")
+"""Last words of keys that take a run folder, or folders with runs in them."""
+
+RUN_FILE = "config.yaml"
+MANY = 3000
+"""Entries of a folder that are looked at, at a key press, to see whether it leads to a run."""
+
 POLICIES = ("policy", "start_from")
+YAML = (".yaml", ".yml")
 SUFFIXES = {
     "logs": (".parquet",),
     "log": (".parquet",),
     "recordings": (".parquet",),
     "files": (".parquet",),
     "bundle": (".zip",),
-    "file": (".zip", ".npz"),
+    "file": (".npz",),
     "network": (".onnx", ".pt", ".jit"),
     "subjects": (".zip",),
-    "folders": (),
     "checkpoint": (".pt",),
     "command": (".csv",),
-    "path": ("",),
-    "out": ("",),
+    "plugins": (".py",),
+    "mjcf": (".xml", ".urdf"),
+    "export_check.file": (".zip",),
+    "deploy.feet": (".json",),
+    "deploy.motion": (".csv",),
+    **dict.fromkeys(("options", "columns", "spec"), YAML),
+    **dict.fromkeys(("path", "out", "dir", "folder"), ("",)),
 }
-"""Last word of a key whose value is a file -> endings of such files; folders are always offered."""
+"""Last word of a key whose value is a file, also of one verb's -> endings of such files; folders are offered, too."""
 
 WORDS = {
     "command": ("sinusoid", "keyboard", "gamepad"),
@@ -71,7 +82,7 @@ BASH = r"""_go1exp()
         compopt -o nospace 2>/dev/null
     fi
 }
-complete -o bashdefault -o default -F _go1exp go1exp"""
+complete -F _go1exp go1exp"""
 
 FISH = """function __go1exp
     set -lx COMP_LINE (commandline -cp)
@@ -187,7 +198,7 @@ def _by_position(verb: str, word: str, before: Sequence[str], folders: Sequence[
     if key == "source":
         return sorted(name for name in _importers() if name.startswith(word))
     named = [name for name in _shipped() if name.startswith(word)] if key == "subjects" else []
-    return [*named, *_paths(word, SUFFIXES.get(key, ("",)))]
+    return [*named, *_places(verb, key, word)]
 
 
 def _shipped() -> list[str]:
@@ -227,7 +238,7 @@ def _members(verb: str, key: str, value: str, before: Sequence[str], folders: Se
     if key in groups_of(verb) or (key not in _settings(verb) and any(key in groups_in(folder) for folder in folders)):
         answers += _levels(choice_files(key, folders), value)
         if not answers or "/" in value:
-            answers += [a for a in _paths(value, (".yaml", ".yml")) if a not in answers] if value else []
+            answers += [a for a in _paths(value, YAML) if a not in answers] if value else []
         return answers
     if last in POLICIES:
         answers += [name for name in _shipped() if name.startswith(value)]
@@ -235,10 +246,8 @@ def _members(verb: str, key: str, value: str, before: Sequence[str], folders: Se
         answers += [name for name in WORDS[last] if name.startswith(value)]
     if (verb, key) == ("list", "group"):
         answers += [name for name in _listed(folders) if name.startswith(value)]
-    if last in RUNS:
-        answers += _paths(value, (), runs=True)
-    elif last in SUFFIXES and not (last == "command" and not value):
-        places = [*(_checkpoints(before) if last == "checkpoint" else ()), *_paths(value, SUFFIXES[last])]
+    if {last, f"{verb}.{last}"} & {*RUNS, *SUFFIXES} and not (last == "command" and not value):
+        places = [*(_checkpoints(before) if last == "checkpoint" else ()), *_places(verb, last, value)]
         answers += [place for place in places if place.startswith(value)]
     if not answers:
         default = _select(_settings(verb, before, folders), key)
@@ -255,17 +264,38 @@ def _levels(names: Sequence[str] | dict[str, Path], value: str) -> list[str]:
     return list(dict.fromkeys(levels))
 
 
+def _places(verb: str, key: str, value: str) -> Iterator[str]:
+    """Complete a value that is a file or a folder."""
+    endings = () if key in RUNS else SUFFIXES.get(f"{verb}.{key}") or SUFFIXES[key]
+    return _paths(value, endings, runs=key in (*RUNS, "subjects"))
+
+
 def _paths(value: str, suffixes: Sequence[str], runs: bool = False) -> Iterator[str]:
-    """Complete a path: folders with a slash, files with one of the endings; with ``runs``, run folders without one."""
+    """Complete a path: folders with a slash, files with one of the endings; with ``runs``, run folders without one.
+
+    Of runs alone, without endings, only run folders and folders that lead to some are offered.
+    """
     head, slash, tail = value.rpartition("/")
     folder = Path(head + slash).expanduser()
     for path in sorted(folder.iterdir(), key=lambda p: p.name) if folder.is_dir() else ():
         if not path.name.startswith(tail) or (path.name.startswith(".") and not tail.startswith(".")):
             continue
         if path.is_dir():
-            yield f"{head}{slash}{path.name}" + ("" if runs and (path / "config.yaml").is_file() else "/")
+            if not runs or suffixes or _leads_to_run(path):
+                yield f"{head}{slash}{path.name}" + ("" if runs and (path / RUN_FILE).is_file() else "/")
         elif suffixes and path.name.endswith(tuple(suffixes)):
             yield f"{head}{slash}{path.name}"
+
+
+def _leads_to_run(folder: Path) -> bool:
+    """Return whether a folder is a run or has one below; true, too, where it has too many entries to know."""
+    seen = 0
+    for _, below, files in os.walk(folder):
+        seen += len(below) + len(files)
+        if RUN_FILE in files or seen > MANY:
+            return True
+        below[:] = [name for name in below if not name.startswith(".")]
+    return False
 
 
 def _checkpoints(before: Sequence[str]) -> list[str]:
