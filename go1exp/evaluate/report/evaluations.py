@@ -7,12 +7,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from go1exp.config.schema.registry import ConfigError, unknown_name
+from go1exp.config.schema.registry import ConfigError, members, unknown_name
 from go1exp.evaluate.protocol.base import Chosen, Protocol, chosen
 from go1exp.evaluate.quantities import AXES, COLUMNS, FELL, FILE, MOVING, ROBOT, Column, columns_of, rows_file
 from go1exp.evaluate.report.study import Run, Study
@@ -77,9 +77,11 @@ def check_figures(wanted: Sequence[str], known: Sequence[Evaluation], to_come: S
     """Refuse quantities that no evaluation has, or of no better direction; raise ConfigError with nearest names."""
     columns = [c for each in known for c in each.columns]
     columns += [c for each in to_come for c in (each.protocol.columns() if each else _grid_columns())]
+    if not columns:  # nothing is compared, and a note says so
+        kinds = [cast(type[Protocol], entry.target) for entry in members("protocol").values()]
+        columns = [*_grid_columns(), *(c for kind in kinds for c in kind.robot_columns)]
     better = {c.name for c in columns if c.better}
-    problems = [unknown_name("figures", name, better, "figure") for name in wanted if name not in better]
-    if columns and problems:  # without columns nothing is compared, and a note says so
+    if problems := [unknown_name("figures", name, better, "figure") for name in wanted if name not in better]:
         raise ConfigError(problems)
 
 
