@@ -490,21 +490,95 @@ def test_two_files_of_one_name_are_both_kept() -> None:
     assert len(parse_train(run_folder.read_config(Path("run"))).task.reward) == len(container["reward"])
 
 
+WRITES = {
+    "s.joint_pos.clamp_(-9.0, 9.0)": "joint_pos of the Snapshot",  # even where it changes no value
+    "s.command.numpy()[:, 1] = 7.0": "command of the Snapshot",
+    "s.joint_vel.data[:] = 7.0": "joint_vel of the Snapshot",
+}
+
+
+def first_step(*overrides: str, **groups: Any) -> None:
+    container = compose("train", ["plugins=[my_terms.py]", *overrides, "backend.threads=1"])
+    core = Go1Core(parse_task(container | groups), 2)
+    core.reset()
+    core.step(torch.zeros(2, 12))
+
+
+@pytest.mark.parametrize("line", WRITES)
 @pytest.mark.parametrize("group", ["reward", "termination", "observation"])
-def test_a_term_that_writes_into_the_snapshot_is_named_with_its_plugin_at_the_first_step(group: str) -> None:
+def test_a_term_that_writes_into_the_snapshot_is_named_with_its_plugin_at_the_first_step(group: str, line: str) -> None:
     shaped = {"reward": "[:, 0]", "termination": "[:, 0] > 9", "observation": ""}[group]
     size = ", size=12" if group == "observation" else ""
     write(
         "my_terms.py",
         f'from go1exp.extend import {group}\n\n\n@{group}("marks"{size})\ndef marks(s):\n'
-        f'    """Writes."""\n    s.joint_pos.clamp_(-9.0, 9.0)\n    return s.joint_pos{shaped}\n',
+        f'    """Writes."""\n    {line}\n    return s.joint_pos{shaped}\n',
     )
-    override = "+reward.marks.weight=1" if group == "reward" else f"+{group}.marks={{}}"
-    core = Go1Core(parse_task(compose("train", ["plugins=[my_terms.py]", override, "backend.threads=1"])), 2)
+    with pytest.raises(ConfigError, match=rf"^{group}\.marks \(my_terms\.py\): writes into {WRITES[line]}"):
+        first_step("+reward.marks.weight=1" if group == "reward" else f"+{group}.marks={{}}")
 
-    def begin() -> None:
-        core.reset()
-        core.step(torch.zeros(2, 12))
 
-    with pytest.raises(ConfigError, match=rf"^{group}\.marks \(my_terms\.py\): writes into joint_pos of the Snapshot"):
-        begin()
+ADVANCES = """
+from go1exp.extend import Memory, command, curriculum, event, observation
+
+
+@observation("marks", size=12)
+class Marks(Memory):
+    \"""Writes while it advances.\"""
+
+    def __init__(self, setup):
+        pass
+
+    def reset(self, mask):
+        pass
+
+    def advance(self, s):
+        s.joint_pos[:, 0] = 0.0
+
+    def __call__(self, s):
+        return s.joint_pos.clone()
+
+
+@command("marks")
+class Held(Memory):
+    \"""Writes into what begins anew.\"""
+
+    def __init__(self, stream):
+        self.value = stream.uniform(3)
+
+    def advance(self, dt, restart):
+        restart |= True
+
+
+@event("marks")
+class Pushes(Held):
+    \"""Writes into what begins anew.\"""
+
+    def advance(self, state, dt, restart):
+        restart.fill_(False)
+
+
+@curriculum("marks")
+class Levels:
+    \"""Writes into the levels of all robots.\"""
+
+    def __call__(self, level, distance, commanded_distance, tile_size, max_level, random_level):
+        return level.add_(1)
+"""
+
+
+@pytest.mark.parametrize(
+    ("overrides", "groups", "named"),
+    [
+        (["+observation.marks={}"], {}, r"observation\.marks .*: writes into joint_pos of the Snapshot"),
+        ([], {"command": {"term": "marks"}}, r"command\S* .*: writes into restart"),
+        (["+event.marks={}"], {}, r"event\.marks .*: writes into restart"),
+        (["terrain=rough"], {"curriculum": {"marks": {}}}, r"curriculum\.marks .*: writes into level"),
+    ],
+)
+def test_what_a_plugin_is_given_to_read_is_not_written_into(
+    overrides: list[str], groups: dict[str, Any], named: str
+) -> None:
+    write("my_terms.py", ADVANCES)
+    with pytest.raises(ConfigError, match=f"^{named}; clone what is to change"):
+        first_step(*overrides, **groups)

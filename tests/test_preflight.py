@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import warnings
 from pathlib import Path
 
 import pytest
@@ -124,13 +125,23 @@ def test_online_logging_without_a_key_is_refused(tmp_path: Path, monkeypatch: py
 # ---------------------------------------------------------------------- curriculum
 
 
-@pytest.mark.parametrize("choice", ["command.standing_fraction=1.0", "command.zero_fraction=1.0", "terrain.rows=1"])
+TINY = "command.lin_vel_x=[-0.01,0.01] command.lin_vel_y=[0,0] command.ang_vel_z=[-0.02,0.02]"
+SLOW = "command.lin_vel_x=[0,0] command.lin_vel_y=[0,0] command.ang_vel_z=[-0.2,0.2]"
+
+
+@pytest.mark.parametrize(
+    "choice",
+    ["command.standing_fraction=1.0", "command.zero_fraction=1.0", "terrain.rows=1", TINY],
+)
 def test_a_curriculum_that_promotes_no_robot_is_warned_of(choice: str) -> None:
     rough = ("terrain=rough", "curriculum=terrain_level", "curriculum.terrain_level.start_level_max=0")
     with pytest.warns(UserWarning, match=r"^curriculum\.terrain_level: promotes no robot; "):
-        preflight.warn_of_idle_curriculum(config(*rough, choice))
-    preflight.warn_of_idle_curriculum(config(*rough))
-    preflight.warn_of_idle_curriculum(config("terrain=rough", choice))
+        preflight.warn_of_idle_curriculum(config(*rough, *choice.split()))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        preflight.warn_of_idle_curriculum(config(*rough))
+        preflight.warn_of_idle_curriculum(config(*rough, *SLOW.split()))
+        preflight.warn_of_idle_curriculum(config("terrain=rough", *choice.split()))
 
 
 def test_a_ground_that_does_not_fit_is_refused_by_its_own_keys(monkeypatch: pytest.MonkeyPatch) -> None:

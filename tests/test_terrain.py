@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from go1exp.mdp.curricula import TerrainLevel
+from go1exp.mdp.curricula import TerrainLevel, TrackedPath
 from go1exp.mdp.ground import GroundHeight
 from go1exp.sim.physics.scene import add_to_spec
 from go1exp.sim.task import parse_parts
@@ -372,3 +372,25 @@ def test_terrain_levels_move_by_the_rule(level: int, distance: float, commanded:
     )
     assert after.dtype == torch.int64
     assert after.tolist() == [expected, 5]  # and the neighbour stays where it was
+
+
+def test_only_robots_that_follow_are_promoted_whatever_the_direction_of_the_command() -> None:
+    """Commanded ahead, back, sideways, on the spot and round a circle; a second set of robots stands."""
+    command = torch.tensor([(0.5, 0, 0), (-0.5, 0, 0), (0, 0.4, 0), (0, 0, 1), (0, 0, -1), (0.5, 0, 1)]).repeat(2, 1)
+    moves = torch.arange(12) < 6
+    path, dt, level = TrackedPath(12, torch.device("cpu")), 0.02, torch.full((12,), 3)
+    position, yaw = torch.zeros(12, 3), torch.zeros(12)
+
+    def attitude() -> torch.Tensor:
+        return torch.stack([(yaw / 2).cos(), 0 * yaw, 0 * yaw, (yaw / 2).sin()], dim=1)
+
+    path.begin(moves | True, position, attitude())
+    for _ in range(500):
+        x, y, rate = (command * moves.unsqueeze(1)).unbind(1)
+        yaw = yaw + rate * dt / 2
+        position = position + dt * torch.stack([x * yaw.cos() - y * yaw.sin(), x * yaw.sin() + y * yaw.cos(), 0 * x], 1)
+        yaw = yaw + rate * dt / 2
+        path.advance(dt, command, position, attitude())
+    tracked, commanded = path.lengths().unbind(1)
+    torch.testing.assert_close(tracked[:5], torch.tensor([5.0, 5.0, 4.0, 2.5, 2.5]), rtol=1e-3, atol=0.0)
+    assert TerrainLevel()(level, tracked, commanded, 8.0, 9, level).tolist() == 6 * [4] + 6 * [2]

@@ -32,7 +32,7 @@ from go1exp.sim.env.engine import CapturedStep, Restarts, make_backend
 from go1exp.sim.env.faults import Evidence, accuse
 from go1exp.sim.env.metrics import GaitLog, TaskLog
 from go1exp.sim.env.plant import Plant, actuator_setup
-from go1exp.sim.env.terms import StepTerms
+from go1exp.sim.env.terms import StepTerms, reading, watched
 from go1exp.sim.physics.scene import build_model
 from go1exp.sim.schedule import CONTACT_TIME, DELAY, FEET_CONTACT_FIELD, SHARES
 from go1exp.sim.task import TaskConfig
@@ -121,7 +121,7 @@ class Go1Core:
         self._grade = to_device(t.difficulty_per_level)[self.tile_column]
         extent = to_device(t.extent if self._bounded else (-inf, inf, -inf, inf))
         self._map = extent[[0, 2]] + MAP_MARGIN, extent[[1, 3]] - MAP_MARGIN
-        self._curriculum = [t() for t in self.task.curriculum]
+        self._curriculum = [reading("curriculum", t, t()) for t in self.task.curriculum]
         start = min([self._max_level, *(getattr(rule, "start_level_max", inf) for rule in self._curriculum[:1])])
         self._start_levels = int(start) + 1
 
@@ -130,10 +130,10 @@ class Go1Core:
         task = self.task
         setup = actuator_setup(task.robot, task.sim.physics_dt, self.backend, actuators)
         self.plant = Plant(self.backend, setup, task.actuator, task.effect)
-        self.command = task.command(self.random.stream("command"))
+        self.command = watched("command", task.command, task.command(self.random.stream("command")))
         if isinstance(self.command, UniformVelocity):
             self.command.ground = self.level, self._grade
-        self.events = {t.key: t(self.random.stream(f"event.{t.key}")) for t in task.event}
+        self.events = {t.key: watched("event", t, t(self.random.stream(f"event.{t.key}"))) for t in task.event}
         self.observation_size = self.terms.observation_size
         ground = self._ground if self._bounded else None
         self._scan = HeightScan(ground, self.device) if "height_scan" in self.terms.read else None

@@ -6,6 +6,8 @@ columns: the frame, that of one policy step before, and so on, each with the noi
 
 from __future__ import annotations
 
+import functools
+import inspect
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import fields, replace
 from typing import Any
@@ -24,24 +26,49 @@ from go1exp.sim.schedule import WEIGHT
 from go1exp.sim.task import TaskConfig
 
 
-def _reading(group: str, term: Term, call: Call) -> Call:
-    """Return a plugin's term that its first call shows to read the Snapshot alone; ConfigError if it writes into it."""
-    tried = False
+def reading(group: str, term: Term, call: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a plugin's function that its first call shows to write into none of the tensors that it is given.
 
-    def checked(s: Snapshot) -> Tensor:
-        nonlocal tried
-        if tried:
-            return call(s)
-        tried = True
-        given = {f.name: getattr(s, f.name) for f in fields(s)}
-        before = {name: (value, value._version) for name, value in given.items() if isinstance(value, Tensor)}
-        value = call(s)
-        if written := [name for name, (tensor, version) in before.items() if tensor._version != version]:
-            where = f"{group}.{term.key} ({origin(term.entry)})"
-            raise ConfigError([f"{where}: writes into {', '.join(written)} of the Snapshot; clone what is to change"])
-        return value
+    Its error is a ConfigError. A function of this package is returned as it is; attributes are kept.
+    """
+    if (plugin := origin(term.entry)) is None:
+        return call
+    untried = True
+
+    @functools.wraps(call)
+    def checked(*given: Any) -> Any:
+        nonlocal untried
+        if not untried:
+            return call(*given)
+        untried = False
+        tensors: dict[str, Tensor] = {}
+        for name, value in zip(inspect.signature(call).parameters, given, strict=False):
+            parts = {name: value}
+            if isinstance(value, Snapshot):
+                parts = {f"{f.name} of the Snapshot": getattr(value, f.name) for f in fields(value)}
+            tensors |= {key: part for key, part in parts.items() if isinstance(part, Tensor)}
+        before = {name: (tensor._version, tensor.clone()) for name, tensor in tensors.items()}
+        result = call(*given)
+        # Views of NumPy and of ``data`` count no versions.
+        written = [
+            name
+            for name, (version, copy) in before.items()
+            if tensors[name]._version != version or not tensors[name].allclose(copy, 0.0, 0.0, equal_nan=True)
+        ]
+        if written:
+            where = f"{group}.{term.key} ({plugin})"
+            raise ConfigError([f"{where}: writes into {', '.join(written)}; clone what is to change"])
+        return result
 
     return checked
+
+
+def watched(group: str, term: Term, part: Any) -> Any:
+    """Return an object that a term made; of a plugin, its ``advance`` and ``reset`` are checked by ``reading``."""
+    for name in ("advance", "reset") if origin(term.entry) is not None else ():
+        if hasattr(part, name):
+            setattr(part, name, reading(group, term, getattr(part, name)))
+    return part
 
 
 class Frames(Memory):
@@ -172,10 +199,10 @@ class StepTerms:
 
         def calls(group: str, terms: Sequence[Term]) -> list[Call]:
             """Return the terms as functions of a Snapshot."""
-            made: list[Call] = [t(setup) if t.entry.remembers else t for t in terms]
+            made: list[Call] = [watched(group, t, t(setup)) if t.entry.remembers else t for t in terms]
             named = list(zip(terms, made, strict=True))
             self._remembering |= {f"{group}.{t.key}": call for t, call in named if t.entry.remembers}
-            return [call if origin(t.entry) is None else _reading(group, t, call) for t, call in named]
+            return [reading(group, t, call) for t, call in named]
 
         kept = (t for t in task.reward if t.slots[WEIGHT] != 0.0 or f"reward.{t.key}.{WEIGHT}" in changing)
         self.rewards = [self._with_changing(t) for t in kept]
