@@ -14,8 +14,9 @@ from torch import nn
 from go1exp import robot
 from go1exp.base.paths import data_root
 from go1exp.config.schema.registry import ConfigError
-from go1exp.deploy.export.contract import alternatives, at_rest, build_foreign
+from go1exp.deploy.export.contract import alternatives, at_rest, build_foreign, drive
 from go1exp.deploy.export.foreign import ORDERS, PRESETS, Front, Spec, config_of, spec_of
+from go1exp.deploy.export.foreign_graph import Network
 from go1exp.deploy.export.graph import ExportError
 from go1exp.deploy.runtime.bundle import load
 from go1exp.deploy.runtime.commands import CommandConfig
@@ -73,8 +74,8 @@ def contract(tmp_path: Path, preset: str) -> str:
     return str(file)
 
 
-def exported(module: nn.Module, file: Path) -> Path:
-    torch.jit.trace(module.eval(), torch.zeros(2, 48)).save(str(file))
+def exported(module: nn.Module, file: Path, size: int = 48) -> Path:
+    torch.jit.trace(module.eval(), torch.zeros(2, size)).save(str(file))
     return file
 
 
@@ -199,3 +200,48 @@ def test_first_targets_are_compared_with_the_own_pose_and_limit_of_each_joint(tm
     assert at_rest(spec, target)[1:] == ["warning: first targets with torques beyond the limit: FL_hip"]
     target[robot.JOINTS.index("RL_thigh")] = -0.7
     assert at_rest(spec, target)[2:] == ["warning: first targets beyond the stops: RL_thigh"]
+
+
+def given(tmp_path: Path, joint_vel: str, *lines: str) -> Spec:
+    terms = f"observation: [ang_vel, projected_gravity, commands, joint_pos, {{term: joint_vel, {joint_vel}}}, actions]"
+    file = tmp_path / "spec.yaml"
+    file.write_text("\n".join(["preset: isaaclab", terms, *lines, ""]))
+    return spec_of(str(file), {})[0]
+
+
+def front_of(tmp_path: Path, joint_vel: str) -> Front:
+    spec = given(tmp_path, joint_vel)
+    return Front(spec, config_of(spec)[1])
+
+
+@pytest.mark.parametrize(
+    ("clip", "low", "high"),
+    [("5", -5.0, 5.0), ("[null, 5]", -8.0, 5.0), ("[-2, null]", -2.0, 8.0), ("[-2, 5]", -2.0, 5.0)],
+)
+def test_a_term_is_clipped_on_one_side_or_both_and_scaled_by_hip_thigh_and_calf(
+    clip: str, low: float, high: float, tmp_path: Path
+) -> None:
+    front = front_of(tmp_path, f"clip: {clip}, scale: [1, 2, 3]")
+    readings = {port.name: torch.zeros(2, port.size) for port in front.inputs}
+    readings["imu_quat"][:, 0] = 1.0
+    readings["joint_vel"][:] = torch.tensor([[-8.0], [8.0]])
+    start = 3 + 3 + 3 + 12
+    seen = front(*[readings[port.name] for port in front.inputs])[1][:, start : start + 12]
+    torch.testing.assert_close(seen, torch.tensor([[low], [high]]) * torch.tensor([1.0, 2.0, 3.0]).repeat_interleave(4))
+
+
+@pytest.mark.parametrize(
+    ("setting", "named"),
+    [("clip: [5, 1]", "clip"), ("clip: [5]", "clip"), ("scale: [1, 2]", "joint_vel.scale: 2 values")],
+)
+def test_a_clip_or_scale_of_a_term_that_cannot_be_is_refused_by_name(setting: str, named: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=rf"observation.*{named}"):
+        front_of(tmp_path, setting)
+
+
+@pytest.mark.parametrize(("decimation", "period"), [(4, 0.02), (2, 0.01)])
+def test_an_imported_policy_is_tried_at_its_own_period(decimation: int, period: float, tmp_path: Path) -> None:
+    still = exported(nn.Linear(45, 12), tmp_path / "policy.pt", 45)
+    spec = given(tmp_path, "scale: 1", "physics_dt: 0.005", f"decimation: {decimation}")
+    _, trace, _ = drive(config_of(spec)[1], [spec], Network(still, 45))
+    np.testing.assert_allclose(np.diff(trace["time"]), period)

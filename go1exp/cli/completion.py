@@ -289,10 +289,10 @@ def _paths(value: str, suffixes: Sequence[str], runs: bool = False) -> Iterator[
 
 def _leads_to_run(folder: Path) -> bool:
     """Return whether a folder is a run or has one below; true, too, where it has too many entries to know."""
-    seen = 0
+    entries = 0
     for _, below, files in os.walk(folder):
-        seen += len(below) + len(files)
-        if RUN_FILE in files or seen > MANY:
+        entries += len(below) + len(files)
+        if RUN_FILE in files or entries > MANY:
             return True
         below[:] = [name for name in below if not name.startswith(".")]
     return False

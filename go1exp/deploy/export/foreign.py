@@ -82,8 +82,8 @@ class Observed:
 
     Attributes:
         term: name, registered here or of the other framework.
-        scale: factor, one or one for each number.
-        clip: bound of the value before the scale.
+        scale: factor, one or one for each number; of joints also hip, thigh, calf.
+        clip: bound of the value before the scale, or lowest and highest value, null for none.
         history: frames; null takes that of the specification.
         quaternion: how training took the attitude; inverse and xyzw are mistakes that a policy may have learnt.
         relative: joint positions are relative to the default pose.
@@ -92,11 +92,23 @@ class Observed:
 
     term: str
     scale: float | tuple[float, ...] = 1.0
-    clip: Positive | None = None
+    clip: Positive | tuple[float | None, float | None] | None = None
     history: Annotated[int, Field(ge=1, le=64)] | None = None
     quaternion: Literal["wxyz", "xyzw", "inverse"] = "wxyz"
     relative: bool = True
     parameters: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        low, high = self.bounds
+        if low is not None and high is not None and low >= high:
+            raise ValueError(f"clip = {list(self.bounds)}: the lowest value must be below the highest")
+
+    @property
+    def bounds(self) -> tuple[float | None, float | None]:
+        """Lowest and highest value before the scale; None where there is none."""
+        if isinstance(self.clip, tuple):
+            return self.clip
+        return (None, None) if self.clip is None else (-self.clip, self.clip)
 
 
 @schema.settings
@@ -275,6 +287,8 @@ class Front(Observing):
             per_joint = term.entry.name.startswith(("joint_", "previous_action"))
             size, name = frame_width(term), term.entry.name
             factor = np.array(observed.scale, dtype=float)
+            if per_joint and factor.size == len(robot.JOINT_KINDS):
+                factor = spread(observed.scale, robot.JOINTS)[order]
             if factor.ndim and len(factor) != size:
                 raise ConfigError([f"observation.{observed.term}.scale: {len(factor)} values for {size} numbers"])
             gain = gains.get(name, sign) if per_joint else np.ones(size)
@@ -308,8 +322,8 @@ class Front(Observing):
             changed = value[:, columns] * gain + shift
             if term.entry.name == "previous_action" and self._offset:  # there was none before the first step
                 changed = changed * (value.abs().sum(-1, keepdim=True) > 0).to(changed.dtype)
-            if observed.clip is not None:
-                changed = changed.clamp(-observed.clip, observed.clip)
+            if observed.bounds != (None, None):
+                changed = changed.clamp(*observed.bounds)
             changed = changed * factor
             bound = self._spec.observation_clip
             frames.append(changed if bound is None else changed.clamp(-bound, bound))
