@@ -566,7 +566,11 @@ class Walk:
             stand = ["support=ground"] if leaf.key == "sensors.truth" else []  # a held trunk does not move
             return ["backend.threads=1", *walk, *stand]
         if leaf.program == "record_audit":
-            return [f"files=[{self.recorded('whole', {})}]"]
+            folders = [
+                self.recorded("whole", {}),
+                *([self.recorded("second", {"seed": 5})] if leaf.key == "tables" else []),
+            ]
+            return [f"files=[{','.join(map(str, folders))}]"]  # the table of a single one is always printed
         if leaf.program == "record_import" and leaf.key == "columns":
             table = ["source=csv", f"path={self.logs(0)}", "options={robot: go2, rate_hz: 100.0}"]
             return [*table, "columns={q_hip: jpos0}"]

@@ -13,6 +13,7 @@ from go1exp.config.schema.registry import Fraction, Positive, PositiveRange, Spe
 if TYPE_CHECKING:
     from torch import Tensor
 
+AXES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
 SLOW = 0.2
 """Share of the ranges that slow commands are drawn from."""
 
@@ -78,9 +79,13 @@ class UniformVelocity(Memory):
         self.value.copy_(torch.where(due.unsqueeze(1), draw[:, :3] * asked * self._in_force(), self.value))
         self.time_left.copy_(torch.where(due, draw[:, 3], self.time_left))
 
-    def change(self, name: str, value: float) -> None:
-        """Change ``zero_fraction`` or ``slow_fraction``, which must not have been 0, in place."""
-        self._shares[name].fill_(value)
+    def change(self, name: str, value: float | tuple[float, float]) -> None:
+        """Change ``zero_fraction`` or ``slow_fraction``, which must not have been 0, or a range of velocities."""
+        if isinstance(value, tuple):
+            axis = AXES.index(name)
+            self._low[axis], self._high[axis] = value
+        else:
+            self._shares[name].fill_(value)
 
     def share(self) -> Tensor | float:
         """Share of the ranges that velocities are drawn from."""

@@ -29,6 +29,8 @@ CONTACT_TIME = "contact.time_constant"
 WEIGHT = "weight"
 SHARES = ("command.zero_fraction", "command.slow_fraction")
 """Shares of commands; one that is 0 is not drawn, and cannot change."""
+RANGES = ("command.lin_vel_x", "command.lin_vel_y", "command.ang_vel_z")
+"""Ranges that commands are drawn from."""
 FEET_CONTACT_FIELD = "geom_solref"
 """Model field that holds the time constant of the feet's contacts."""
 
@@ -86,7 +88,7 @@ def _with_end(ramp: Ramp, parts: Mapping[str, Any]) -> Ramp:
         value: Value = parts["contact"].time_constant
     elif ramp.path == DELAY:
         value = parts["actuator"].parameters["command"]
-    elif ramp.path in SHARES:
+    elif ramp.path in (*SHARES, *RANGES):
         value = parts["command"].parameters[ramp.path.removeprefix("command.")]
     else:
         key, _, name = ramp.path.removeprefix("reward.").rpartition(".")
@@ -99,11 +101,12 @@ def changeable(parts: Mapping[str, Any]) -> list[str]:
     """Return the keys of all settings that a schedule may change: of rewards, delay, contact and commands."""
     paths = [f"reward.{t.key}.{name}" for t in parts.get("reward") or () for name in (WEIGHT, *_numbers(t))]
     command = parts["command"].parameters if parts.get("command") else {}
-    shares = [path for path in SHARES if command.get(path.removeprefix("command."))]
+    drawn = [path for path in SHARES if command.get(path.removeprefix("command."))]
+    drawn += [path for path in RANGES if isinstance(command.get(path.removeprefix("command.")), tuple)]
     contact = [CONTACT_TIME] if parts.get("contact") else []
     actuator = parts.get("actuator")
     delay = [DELAY] if actuator is not None and actuator.entry.name == "delay" else []
-    return [*paths, *delay, *contact, *shares]
+    return [*paths, *delay, *contact, *drawn]
 
 
 def _numbers(term: Term) -> list[str]:

@@ -274,8 +274,6 @@ class Ramp(Strict):
         """Check what concerns two settings."""
         if self.start is not None and self.when is not None:
             raise ValueError("when: start has no meaning beside it; give one of the two")
-        if self.last is not None and isinstance(self.first, tuple) != isinstance(self.last, tuple):
-            raise ValueError("to: must have as many numbers as from")
 
     def value(self, since_start: float) -> Value:
         """Return the value some time, in ``unit``, after the ramp's start; negative before it."""

@@ -34,7 +34,7 @@ from go1exp.sim.env.metrics import GaitLog, TaskLog
 from go1exp.sim.env.plant import Plant, actuator_setup
 from go1exp.sim.env.terms import StepTerms, reading, watched
 from go1exp.sim.physics.scene import build_model
-from go1exp.sim.schedule import CONTACT_TIME, DELAY, FEET_CONTACT_FIELD, SHARES
+from go1exp.sim.schedule import CONTACT_TIME, DELAY, FEET_CONTACT_FIELD, RANGES, SHARES
 from go1exp.sim.task import TaskConfig
 from go1exp.sim.terrain import build_terrain
 
@@ -151,13 +151,14 @@ class Go1Core:
     def change(self, path: str, value: Value) -> None:
         """Change a setting of a running environment (``sim/schedule.py``), in place: a captured step sees it too.
 
-        A delay counts from each robot's next episode on, a share of commands from its next command, all else at once.
+        A delay counts from each robot's next episode on, what commands are drawn from with its next
+        command, all else at once.
         """
         if path == DELAY:
             self.plant.actuator.set_range(*value)  # type: ignore[attr-defined, misc]  # checked with the schedule
         elif path == CONTACT_TIME:
             self.backend.field(FEET_CONTACT_FIELD)[:, self.backend.ids("geom", robot.FEET), 0] = value  # type: ignore[assignment]
-        elif path in SHARES:
+        elif path in (*SHARES, *RANGES):
             self.command.change(path.removeprefix("command."), value)
         else:
             self.terms.change(path, value)  # type: ignore[arg-type]
