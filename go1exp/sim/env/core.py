@@ -151,8 +151,7 @@ class Go1Core:
     def change(self, path: str, value: Value) -> None:
         """Change a setting of a running environment (``sim/schedule.py``), in place: a captured step sees it too.
 
-        A delay counts from each robot's next episode on, what commands are drawn from with its next
-        command, all else at once.
+        A delay counts from a robot's next episode on, ranges and shares from its next command, all else at once.
         """
         if path == DELAY:
             self.plant.actuator.set_range(*value)  # type: ignore[attr-defined, misc]  # checked with the schedule
