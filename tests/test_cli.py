@@ -313,6 +313,19 @@ def test_effects_come_from_files_by_any_path_and_from_names(tmp_path: Path) -> N
         assert OmegaConf.create(done.stdout).effect == expected, given
 
 
+def test_every_group_takes_a_file(tmp_path: Path) -> None:
+    groups = {"rand": "table1", "command": "paper", "reward": "paper", "schedule": "paper", "event": "push"}
+    groups |= {"termination": "fall", "terrain": "flat", "contact": "stiff", "ppo": "paper", "observation": "paper"}
+    folder = {group: data_root() / "conf" / ("randomization" if group == "rand" else group) for group in groups}
+    files = {group: tmp_path / f"my_{group}.yaml" for group in groups}
+    for group, name in groups.items():
+        files[group].write_text((folder[group] / f"{name}.yaml").read_text())
+    done = refuse(tmp_path, "train", "--cfg", "job", *(f"{group}={file.name}" for group, file in files.items()))
+    assert done.returncode == 0, done.stderr
+    ours = compose("train", [f"{group}={name}" for group, name in groups.items()])
+    assert {g: OmegaConf.create(done.stdout)[g] for g in groups} == {g: ours[g] for g in groups}
+
+
 def test_a_file_can_be_added_where_a_verb_has_no_choice_of_the_group(tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
     file.write_text(FILES["mine.yaml"])

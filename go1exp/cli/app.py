@@ -22,7 +22,7 @@ from go1exp.cli.hydra_main import choices_from_files
 from go1exp.cli.verbs import FLAGS, MODULES, VALUED, protected
 from go1exp.config.choices import CONFIG_DIR, choice_files, config_folder, given_folders
 from go1exp.config.compose import as_hydra_takes_them, composition_problem
-from go1exp.config.hydra_adapter import REFUSED, plain
+from go1exp.config.hydra_adapter import REFUSED, plain, stored_choices
 from go1exp.config.schema import plugins
 from go1exp.config.schema import settings as schema
 from go1exp.config.schema.registry import ConfigError, unknown_name
@@ -158,7 +158,8 @@ def _refuse_unknown_schedule(overrides: Sequence[str], folders: Sequence[Path]) 
     """Raise ConfigError if a chosen schedule has no file; Hydra ignores that, as the group is optional."""
     for chosen in (o.partition("=")[2] for o in overrides if o.lstrip("+").startswith("schedule=")):
         known = choice_files("schedule", [config_folder(), *folders])
-        unknown = [name for name in chosen.split(",") if name not in known and re.fullmatch(r"[\w/]+", name)]
+        taken = {*known, *stored_choices("schedule")}
+        unknown = [name for name in chosen.split(",") if name not in taken and re.fullmatch(r"[\w/]+", name)]
         if unknown:
             raise ConfigError([unknown_name(f"schedule={unknown[0]}", unknown[0], known, "choice of schedule")])
 
