@@ -35,9 +35,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (tmp_path / "runs" / run / "checkpoints").mkdir(parents=True)
         (tmp_path / "runs" / run / "config.yaml").touch()
     (tmp_path / "runs/flat/checkpoints/000400.pt").touch()
-    others = ("net.npz", "walk.zip", "logs/walk.parquet", "gap/effect.yaml")
-    others += ("mine/reward/short.yaml", "mine/weather/wind.yaml")
-    for file in others:
+    logs = ("net.npz", "walk.zip", "logs/walk.parquet", "gap/effect.yaml")
+    for file in (*logs, "mine/reward/short.yaml", "mine/weather/wind.yaml"):
         (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / file).write_text("a: 1\n")
     monkeypatch.chdir(tmp_path)
