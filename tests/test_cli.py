@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -313,14 +314,13 @@ def test_effects_come_from_files_by_any_path_and_from_names(tmp_path: Path) -> N
         assert OmegaConf.create(done.stdout).effect == expected, given
 
 
-def test_every_group_takes_a_file(tmp_path: Path) -> None:
+def test_groups_take_files_of_the_user(tmp_path: Path) -> None:
     groups = {"rand": "table1", "command": "paper", "reward": "paper", "schedule": "paper", "event": "push"}
     groups |= {"termination": "fall", "terrain": "flat", "contact": "stiff", "ppo": "paper", "observation": "paper"}
-    folder = {group: data_root() / "conf" / ("randomization" if group == "rand" else group) for group in groups}
-    files = {group: tmp_path / f"my_{group}.yaml" for group in groups}
     for group, name in groups.items():
-        files[group].write_text((folder[group] / f"{name}.yaml").read_text())
-    done = refuse(tmp_path, "train", "--cfg", "job", *(f"{group}={file.name}" for group, file in files.items()))
+        folder = data_root() / "conf" / ("randomization" if group == "rand" else group)
+        shutil.copy(folder / f"{name}.yaml", tmp_path / f"my_{group}.yaml")
+    done = refuse(tmp_path, "train", "--cfg", "job", *(f"{group}=my_{group}.yaml" for group in groups))
     assert done.returncode == 0, done.stderr
     ours = compose("train", [f"{group}={name}" for group, name in groups.items()])
     composed = OmegaConf.create(done.stdout)

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 AXES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
+"""Parameters that are ranges of velocities: m/s, m/s, rad/s."""
 SLOW = 0.2
 """Share of the ranges that slow commands are drawn from."""
 

@@ -23,14 +23,16 @@ from pydantic import TypeAdapter, ValidationError
 from go1exp.config.schema.physics import ContactConfig
 from go1exp.config.schema.registry import Term, as_json, explain, unknown_name
 from go1exp.config.schema.training import Ramp, Value
+from go1exp.mdp.commands import AXES
 
 DELAY = "actuator.command"
 CONTACT_TIME = "contact.time_constant"
 WEIGHT = "weight"
 SHARES = ("command.zero_fraction", "command.slow_fraction")
 """Shares of commands; one that is 0 is not drawn, and cannot change."""
-RANGES = ("command.lin_vel_x", "command.lin_vel_y", "command.ang_vel_z")
+RANGES = tuple(f"command.{axis}" for axis in AXES)
 """Ranges that commands are drawn from."""
+DRAWN = (*SHARES, *RANGES)
 FEET_CONTACT_FIELD = "geom_solref"
 """Model field that holds the time constant of the feet's contacts."""
 
@@ -88,7 +90,7 @@ def _with_end(ramp: Ramp, parts: Mapping[str, Any]) -> Ramp:
         value: Value = parts["contact"].time_constant
     elif ramp.path == DELAY:
         value = parts["actuator"].parameters["command"]
-    elif ramp.path in (*SHARES, *RANGES):
+    elif ramp.path in DRAWN:
         value = parts["command"].parameters[ramp.path.removeprefix("command.")]
     else:
         key, _, name = ramp.path.removeprefix("reward.").rpartition(".")

@@ -13,6 +13,7 @@ from go1exp import robot
 from go1exp.base import memory
 from go1exp.config.schema.physics import PhysxBackend, WarpBackend
 from go1exp.config.schema.registry import ConfigError
+from go1exp.mdp.commands import AXES
 from go1exp.mdp.curricula import YAW_ARM
 from go1exp.sim.effects.rules import nested_actuators
 from go1exp.sim.env.core import Go1Core
@@ -21,7 +22,7 @@ from go1exp.train import metrics
 from go1exp.train.schedule import check_measures
 
 SLOWEST = 0.02
-"""Commands that are all slower than this, m/s, are none to follow: a robot may sway by half of it in a second."""
+"""Commands that are all slower than this, m/s, cannot be told from the sway of a gait (chosen)."""
 
 LEAST_ROBOTS = 64
 """On each of several GPUs: a tensor is taken for the robots' by its length, which no other has (``train/group.py``)."""
@@ -49,7 +50,7 @@ def check(config: TrainConfig) -> None:
 def warn_of_idle_curriculum(config: TrainConfig) -> None:
     """Warn where the curriculum can promote no robot: one kind of ground, or no command to speak of."""
     task, asked = config.task, config.task.command.parameters
-    axes = [asked[key] for key in ("lin_vel_x", "lin_vel_y", "ang_vel_z") if key in asked]
+    axes = [asked[key] for key in AXES if key in asked]
     arms = (1.0, 1.0, YAW_ARM)
     fastest = math.hypot(*(arm * np.abs(axis).max() for arm, axis in zip(arms, axes, strict=False)))
     reasons = {
@@ -57,7 +58,7 @@ def warn_of_idle_curriculum(config: TrainConfig) -> None:
         "every command is zero, and a robot without a command keeps its level": asked.get("standing_fraction") == 1.0
         or asked.get("zero_fraction") == 1.0
         or (len(axes) == 3 and not np.any(axes)),
-        f"no command is faster than {fastest:.2g} m/s (1 rad/s counts {YAW_ARM:g} m/s), less than a gait sways": (
+        f"no command is faster than {fastest:.2g} m/s (1 rad/s counts {YAW_ARM:g} m/s), as a gait's sway may be": (
             0.0 < fastest < SLOWEST and len(axes) == 3
         ),
     }

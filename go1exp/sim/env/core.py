@@ -34,7 +34,7 @@ from go1exp.sim.env.metrics import GaitLog, TaskLog
 from go1exp.sim.env.plant import Plant, actuator_setup
 from go1exp.sim.env.terms import StepTerms, reading, watched
 from go1exp.sim.physics.scene import build_model
-from go1exp.sim.schedule import CONTACT_TIME, DELAY, FEET_CONTACT_FIELD, RANGES, SHARES
+from go1exp.sim.schedule import CONTACT_TIME, DELAY, DRAWN, FEET_CONTACT_FIELD
 from go1exp.sim.task import TaskConfig
 from go1exp.sim.terrain import build_terrain
 
@@ -157,7 +157,7 @@ class Go1Core:
             self.plant.actuator.set_range(*value)  # type: ignore[attr-defined, misc]  # checked with the schedule
         elif path == CONTACT_TIME:
             self.backend.field(FEET_CONTACT_FIELD)[:, self.backend.ids("geom", robot.FEET), 0] = value  # type: ignore[assignment]
-        elif path in (*SHARES, *RANGES):
+        elif path in DRAWN:
             self.command.change(path.removeprefix("command."), value)
         else:
             self.terms.change(path, value)  # type: ignore[arg-type]
