@@ -22,16 +22,16 @@ from go1exp.logs import recording
 from go1exp.logs.recording import Recording, joint_channels
 from go1exp.sim.task import parse_parts
 from tests.lockstep import lockstep
-from tests.small_run import SMALL
+from tests.small_run import small
 
 STEP = 0.002
 """Training's and the robot's, s."""
 
-LIVELY = (
-    *("ppo.learning_rate=0.03", "ppo.learning_rate_range=[0.03,0.03]", "action.scale=0.35"),
-    *("actuator.kp=35", "actuator.kd=0.7", "ppo.coarse_physics=1"),
+WALKING = (
+    *small("start_from=paper", hidden="[512,256,128]", coarse_physics=1),
+    *("ppo.learning_rate=1e-6", "ppo.learning_rate_range=[1e-6,1e-6]"),
 )
-"""A policy of two iterations that moves the legs a little."""
+"""Two iterations from the weights of a policy that walks."""
 
 TORQUE, SPEED, ANGLE = 0.05, 0.25, 0.006
 """Bounds on the RMSE of a log of the simulator in the simulator, N m, rad/s, rad."""
@@ -68,7 +68,7 @@ def replayed(log: Recording, shift: int) -> Part:
 def test_from_training_to_the_replayed_log(
     real_time: bool, verb: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert verb("train", *SMALL, *LIVELY, "hydra.run.dir=run") == 0
+    assert verb("train", *WALKING, "hydra.run.dir=run") == 0
     assert verb("export", "run=run", "out=walk.zip", "seconds=0.2") == 0
     assert verb("export", "check", "walk.zip") == 0
     words = ["command=[0.4,0,0]", "seconds=2", "stand_up=0.5", "lie_down=1.5", "brake=0.5", "stale=5"]
@@ -104,4 +104,4 @@ def test_from_training_to_the_replayed_log(
     assert found["q"] < ANGLE
     assert part["times_floor"] < 1.5
     for late in (-1, 1):
-        assert replayed(log, late).quantity("tau_est") > 2.0 * found["tau_est"]  # four to seven times
+        assert replayed(log, late).quantity("tau_est") > 4.0 * found["tau_est"]  # nine times

@@ -766,7 +766,12 @@ def wandb_stub(told: list[Any]) -> types.ModuleType:
 
     def init(**arguments: Any) -> Any:
         told.append({k: v for k, v in arguments.items() if k not in ("config", "id", "dir", "settings")})
-        run = {"id": "stub", "log_artifact": lambda artifact: told.append(artifact.files), "finish": lambda: None}
+        run = {
+            "id": "stub",
+            "dir": arguments["dir"],
+            "log_artifact": lambda artifact: told.append(artifact.files),
+            "finish": lambda: None,
+        }
         return types.SimpleNamespace(log=lambda values, step: told.append(sorted(values)), **run)
 
     def artifact(name: str, type: str) -> Any:

@@ -20,9 +20,9 @@ import go1exp.cli.hydra_main as hydra_main
 from go1exp.base import errors
 from go1exp.cli.hydra_main import choices_from_files
 from go1exp.cli.verbs import FLAGS, MODULES, VALUED, protected
-from go1exp.config.choices import CONFIG_DIR, choice_files, config_folder, given_folders
+from go1exp.config.choices import CONFIG_DIR, choice_files, config_folder, given_folders, groups_in
 from go1exp.config.compose import as_hydra_takes_them, composition_problem
-from go1exp.config.hydra_adapter import REFUSED, plain, stored_choices
+from go1exp.config.hydra_adapter import REFUSED, forget_choices, plain, stored_choices
 from go1exp.config.schema import plugins
 from go1exp.config.schema import settings as schema
 from go1exp.config.schema.registry import ConfigError, unknown_name
@@ -85,6 +85,7 @@ class App:
             while _bars:  # one that an error leaves behind hides the terminal's cursor
                 _bars.pop().stop()
             warnings.formatwarning = formatwarning
+            forget_choices(groups_in(config_folder()))
         return next((s for s in status if s), 0) or 0
 
     def _plain(self, config: Any) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import os
 import pickle
 import re
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -213,6 +213,12 @@ def store_choice(group: str, name: str, content: Any, file: Path) -> None:
     ConfigStore.instance().store(group=group, name=name, node=content, provider=str(file), **replace)
 
 
+def forget_choices(groups: Iterable[str]) -> None:
+    """Forget the choices that were made of users' files: another verb may have a setting with a group's name."""
+    for group in groups:
+        ConfigStore.instance().repo.pop(group, None)
+
+
 def stored_choices(group: str) -> dict[str, str]:
     """Return the choices of a group that were made of users' files, each with its file."""
     stored = ConfigStore.instance().repo.get(group, {})
@@ -282,26 +288,20 @@ def _kept(verb: str, choices: tuple[str, ...], folders: tuple[Path, ...], state:
 
 def _stamps(folder: str | Path) -> tuple[tuple[str, int, int], ...]:
     """Return name, time of change and size of each file below a folder."""
-    stamps: list[tuple[str, int, int]] = []
-    with os.scandir(folder) as entries:
-        for entry in entries:
-            if entry.is_dir():
-                stamps += _stamps(entry.path)
-            else:
-                stat = entry.stat()
-                stamps.append((entry.path, stat.st_mtime_ns, stat.st_size))
+    stamps = []
+    for top, _, names in os.walk(folder):
+        for file in (os.path.join(top, name) for name in names):
+            stat = os.stat(file)
+            stamps.append((file, stat.st_mtime_ns, stat.st_size))
     return tuple(sorted(stamps))
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why a composition was refused.
+    """Why a composition was refused; the subject is ``group/choice``, an override or a key, the text is Hydra's.
 
-    Attributes:
-        kind: choice (no such file of a group), grammar, key (no such key), present (an added key exists), type (a
-            group was given a number or mapping), or other.
-        subject: what is refused: ``group/choice``, an override, or a key path.
-        text: Hydra's message in one line.
+    Of kind choice: a group has no such file; key: no such key; present: an added key exists; type: a number or a
+    mapping for a group.
     """
 
     kind: Literal["choice", "grammar", "key", "present", "type", "other"]
@@ -392,8 +392,8 @@ def jobs_of_sweep(config: DictConfig) -> list[list[str]] | None:
     keys = {override.key_or_group for override in typed}
     listed = parser.parse_overrides([f"{key}={value}" for key, value in params.items()])
     parsed = [*(override for override in listed if override.key_or_group not in keys), *typed]
-    swept = {o.input_line: islice(o.sweep_string_iterator(), MOST_JOBS + 1) for o in parsed if o.is_sweep_override()}
-    counts = {line: sum(1 for _ in values) for line, values in swept.items()}
+    swept = {o.input_line: o.sweep_string_iterator() for o in parsed if o.is_sweep_override()}
+    counts = {line: sum(1 for _ in islice(values, MOST_JOBS + 1)) for line, values in swept.items()}
     if math.prod(counts.values()) > MOST_JOBS:
         raise ConfigError([f"{max(counts, key=counts.__getitem__)}: a sweep has at most {MOST_JOBS:,} jobs"])
     return [job for batch in BasicSweeper.split_arguments(parsed, None) for job in batch]
