@@ -641,17 +641,13 @@ COMMANDS = {
 }
 
 
-@pytest.mark.parametrize(
-    ("walk", "share", "moves"),
-    [
-        *((walk, 1.0, 1) for walk in ("fast", "slow", "circle", "turn", "changing")),
-        *((walk, share, -1) for walk in ("fast", "slow", "circle", "turn", "changing") for share in (0.0, -1.0, 2.0)),
-        ("fast", 0.5, 0),
-        ("standing", 0.0, 0),
-    ],
-)
-def test_levels_rise_where_the_commanded_path_is_tracked(walk: str, share: float, moves: int, start_core: Make) -> None:
-    """Trunks that are moved by ``share`` of the commanded twist, exactly, 4 s long."""
+SHARES = {1.0: 1, 0.5: 0, 0.0: -1, -1.0: -1, 2.0: -1}
+"""Share of the commanded twist with which a trunk moves -> change of its level."""
+
+
+@pytest.mark.parametrize("walk", COMMANDS)
+def test_levels_rise_where_the_commanded_path_is_tracked(walk: str, start_core: Make) -> None:
+    """Trunks that are moved by shares of the commanded twist, exactly, 4 s long."""
     x, y, yaw, hold = COMMANDS[walk]
     command = [
         f"command.{k}=[{low},{high}]"
@@ -661,16 +657,17 @@ def test_levels_rise_where_the_commanded_path_is_tracked(walk: str, share: float
     core = start_core(
         *("rand=none", "event=none", "termination=none", *ROUGH, "command=paper", *command, hold_time),
         *("command.standing_fraction=0.0", "sim.episode_s=4.0"),
-        num_envs=6,
+        num_envs=len(SHARES),
         noise=False,
     )
     core.level.fill_(1)
     core.reset()
     pose = core.backend.qpos[:, :7].clone()
-    heading, dt = torch.zeros(6, dtype=torch.float64), core.task.sim.physics_dt
+    share, heading = torch.tensor(list(SHARES)).double(), torch.zeros(len(SHARES), dtype=torch.float64)
+    dt = core.task.sim.physics_dt
 
     def drive() -> None:
-        twist = share * core.command.value.double()
+        twist = share[:, None] * core.command.value.double()
         forward, left = twist[:, 0], twist[:, 1]
         heading.add_(dt * twist[:, 2])
         pose[:, 0] += dt * (forward * heading.cos() - left * heading.sin())
@@ -681,10 +678,10 @@ def test_levels_rise_where_the_commanded_path_is_tracked(walk: str, share: float
     core.driver = drive
     steps = core.task.sim.episode_steps
     for k in range(steps):
-        assert core.level.tolist() == [1] * 6, k
-        ended = core.step(torch.zeros(6, 12)).truncated
+        assert core.level.tolist() == [1] * len(SHARES), k
+        ended = core.step(torch.zeros(len(SHARES), 12)).truncated
     assert ended.all()
-    assert core.level.tolist() == [1 + moves] * 6
+    assert core.level.tolist() == [1 if walk == "standing" else 1 + change for change in SHARES.values()]
 
 
 def test_a_fall_counts_as_the_rest_of_the_path_untracked(start_core: Make) -> None:
