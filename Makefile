@@ -30,14 +30,15 @@ $(OK): pyproject.toml requirements/lock.txt hatch_build.py $(wildcard go1exp/dep
 	@rm -f $@
 	@$(PY) -m venv $(VENV)
 	@echo "setup 2/5: $(TORCH)"
-	@$(PIP) install -qq "$(TORCH)"
+	@$(PIP) install -qq --no-compile "$(TORCH)"
 	@echo "setup 3/5: packages of requirements/lock.txt"
 	@$(call install,lock)
 	@echo "setup 4/5: go1exp itself, editable"
 	@$(PIP) install -qq --no-build-isolation --no-deps -e .
 	@$(BIN)/python -c 'from go1exp.deploy.estimation import compiled; compiled()' 2>&1 | tail -n 1
-	@echo "setup 5/5: check that the packages fit together"
+	@echo "setup 5/5: check that the packages fit together, and compile what go1exp imports of them"
 	@$(PIP) check
+	@$(BIN)/python -c 'import go1exp.gap.stages.explain, go1exp.train.trainer'
 	@touch $@
 
 # Packages of a lock, hash-checked: with uv, or with pip where uv cannot be installed or does not find them.

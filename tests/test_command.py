@@ -19,12 +19,12 @@ from tests.test_cli import HEAVY
 
 SMOKE = {
     "train ppo.iteratons=7": "did you mean 'ppo.iterations'",
-    "train -m ppo.gamma=1.5,2.5": "ppo.gamma = 1.5",
-    "record audit": "files: required",
     "gap logs=x stage=fit search.alpha=2": "search.alpha = 2",
-    "deploy a.zip sim.los=0.1": "did you mean 'sim.loss'",
 }
 MORE = {
+    "train -m ppo.gamma=1.5,2.5": "ppo.gamma = 1.5",
+    "record audit": "files: required",
+    "deploy a.zip sim.los=0.1": "did you mean 'sim.loss'",
     "train +reward.foot_slp={weight:1}": "did you mean 'foot_slip'",
     "eval run=x episodes=0": "episodes = 0",
     "play run=x +grid.x=[1]": "grid: unknown key",

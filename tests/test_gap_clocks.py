@@ -104,7 +104,8 @@ def test_of_stretched_times_those_of_the_speeds_are_taken(motions: list[tuple[np
     assert "The times from the speeds are taken: in the median of" in clocks.sentence(choice)
 
 
-@pytest.mark.parametrize("speeds", [late, pytest.param(noisy, marks=pytest.mark.slow("go1exp/gap/"))])
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
+@pytest.mark.parametrize("speeds", [late, noisy])
 def test_of_speeds_that_are_wrong_the_written_times_are_taken(
     motions: list[tuple[np.ndarray, ...]], speeds: Any
 ) -> None:
@@ -114,6 +115,7 @@ def test_of_speeds_that_are_wrong_the_written_times_are_taken(
     assert choice.errors["recorded"] < choice.errors["speeds"]
 
 
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 def test_where_both_clocks_are_right_nothing_is_decided_and_that_is_said(motions: list[tuple[np.ndarray, ...]]) -> None:
     choice = taken(logs(motions))
     assert (choice.taken, choice.decided) == ("recorded", False)

@@ -97,6 +97,7 @@ def test_a_settled_model_keeps_columns_as_they_were_measured(hung: State) -> Non
     np.testing.assert_allclose(once.table.residual, residual, atol=1e-3 * np.abs(residual).max())
 
 
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 def test_a_settled_model_is_as_good_whatever_its_first_columns_were(
     hung: State, monkeypatch: pytest.MonkeyPatch
 ) -> None:

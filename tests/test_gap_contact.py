@@ -249,7 +249,12 @@ def test_a_hard_floor_is_the_models_own_where_recordings_name_it_and_else_off() 
     right, wrong = (np.log(s.state.held_out({})).mean() for s in (own, other))
     assert right < 0.3
     assert wrong > right + 1.0
-    own, cause = alone(own)
+
+
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
+def test_no_effect_stands_for_a_hard_floor_that_is_the_models_own() -> None:
+    config, recordings = recorded("excitation=[squat,drop]", "contact=stiff", "seeds=[0,1]")
+    own, cause = alone(search_in(recordings, config, None))
     assert cause is None
     assert own.candidates == ()
 

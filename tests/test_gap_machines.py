@@ -434,6 +434,7 @@ def test_a_value_that_is_held_has_no_interval() -> None:
 
 
 @pytest.mark.usefixtures("few")
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/", "conf/model/")
 def test_friction_hidden_in_a_double_pendulum_of_torque_drives_is_named() -> None:
     robot = machine("ak80_double_pendulum_a", tolerances={})
     steps, logs, joints = np.arange(0.0, 2.5, 0.0005), [], ("shoulder", "elbow")

@@ -22,7 +22,7 @@ import torch
 
 from go1exp.base.paths import data_root
 from go1exp.train import checkpoint, metrics, run_folder, trainer
-from tests.command import COMMAND_LINE, run_alone
+from tests.command import COMMAND_LINE
 from tests.command import run as cli
 from tests.small_run import small, train
 
@@ -192,7 +192,7 @@ def test_a_run_stopped_by_ctrl_c_goes_on_with_resume(flat: Path, folder: Path) -
     assert iterations(run / "metrics.csv") == [1, 2, 3]
     assert checkpoint.checkpoints(run)[-1].name == "000003.pt"
 
-    resumed = run_alone(folder, "train", f"resume={run}", SIX)
+    resumed = cli(folder, "train", f"resume={run}", SIX)
     assert resumed.returncode == 0, resumed.stderr
     assert "000003.pt" in resumed.stdout
     assert_the_same_run(run, flat)

@@ -15,7 +15,8 @@ import pytest
 
 from go1exp.config.compose import compose
 from go1exp.train import run_folder, run_state
-from tests.command import environment, run_alone
+from tests.command import environment
+from tests.command import run as cli
 from tests.small_run import SMALL
 
 HOLD = """
@@ -58,7 +59,7 @@ def test_a_second_training_in_a_folder_is_refused_in_one_line(
     run = tmp_path / "run"
     settings = SMALL if again.startswith("hydra") else ()
     before = {p: p.read_bytes() for p in run.iterdir() if p.is_file()}
-    done = run_alone(tmp_path, "train", *settings, again.format(run=run))
+    done = cli(tmp_path, "train", *settings, again.format(run=run))
     assert done.returncode == 1, done.stderr
     who = rf"process {holder.pid} on {re.escape(socket.gethostname())} since \d{{4}}-\d\d-\d\d \d\d:\d\d:\d\d"
     assert re.fullmatch(rf"go1exp train: {re.escape(str(run))}: in use by {who}; .*\n", done.stderr), done.stderr

@@ -86,6 +86,7 @@ def test_a_policy_misses_only_known_criteria_at_every_command(name: str) -> None
     assert tested >= {"trot error", "load share", "clearance", "peak force", "RMSE xy", "RMSE yaw", "falls"}
 
 
+@pytest.mark.slow("assets/policies/", "go1exp/sim/", "go1exp/mdp/", "go1exp/evaluate/", "conf/")
 @pytest.mark.parametrize("name", NAMES)
 def test_a_policy_misses_nothing_else_now(name: str) -> None:
     config, policy, _ = load_run(shipped_policies()[name])
