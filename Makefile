@@ -12,6 +12,9 @@ LOCK_VENV := build/lock-venv
 LOCK = $(LOCK_VENV)/bin/uv pip compile -q --python-version 3.11 --generate-hashes --no-emit-index-url \
   --no-emit-find-links --custom-compile-command "make lock"
 
+# Images often forbid bytecode; every process that a test starts would then compile all that it imports.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help setup docs demo quick test test-all test-slurm test-ray test-tune check sanitise bench runtime image lock clean
