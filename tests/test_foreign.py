@@ -50,7 +50,8 @@ class InTheirs(nn.Module):
         columns = {}
         for term, law in zip(front._terms, front._laws, strict=True):
             size = len(law[0])
-            columns[term.entry.name] = (start, inverse if size == 12 else [0, 1, 2], 1.0 / law[3])
+            sign = torch.as_tensor(spec.joints("joint_sign"), dtype=torch.float32) if size == 12 else 1.0
+            columns[term.entry.name] = (start, inverse if size == 12 else [0, 1, 2], sign / law[3])
             start += size
         for name in PLACES:
             at, index, factor = columns[name]
@@ -58,9 +59,10 @@ class InTheirs(nn.Module):
             gain += [float(factor[k]) for k in index]
         self.order, self.gain = order, torch.tensor(gain)
         self.joints = [robot.JOINTS.index(name) for name in spec.names]
+        self.sign = torch.as_tensor(spec.joints("joint_sign"), dtype=torch.float32)
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        return self.net(obs[:, self.order] * self.gain)[:, self.joints]
+        return self.net(obs[:, self.order] * self.gain)[:, self.joints] * self.sign
 
 
 def contract(tmp_path: Path, preset: str) -> str:
@@ -141,6 +143,63 @@ def test_a_wrong_contract_is_named(line: str, likely: str, tmp_path: Path) -> No
         build_foreign(file, str(wrong))
 
 
+RIGHT_HIPS = "joint_sign: {FR_hip: -1, RR_hip: -1, FL: 1, RL: 1, thigh: 1, calf: 1}\n"
+
+
+@pytest.mark.slow(*ABOUT)
+def test_joints_of_one_side_that_are_reversed_are_named(tmp_path: Path) -> None:
+    stated = Path(contract(tmp_path, "isaaclab"))
+    turned = tmp_path / "turned.yaml"
+    turned.write_text(stated.read_text().replace("FR_hip: -0.1", "FR_hip: 0.1").replace("RR_hip: -0.1", "RR_hip: 0.1"))
+    turned.write_text(turned.read_text() + RIGHT_HIPS)
+    file = exported(InTheirs(spec_of(str(turned), {})[0]), tmp_path / "policy.pt")
+    with pytest.raises(ExportError, match=r"likely mismatch.*stands with: sign: joint_sign reversed \(right hip\)"):
+        build_foreign(file, str(stated))
+    assert "mismatch" not in build_foreign(file, str(turned))[1][-1]
+
+
+@pytest.mark.slow(*ABOUT)
+@pytest.mark.parametrize("layout", ["term", "frame"])
+def test_frames_in_another_order_are_named(layout: str, tmp_path: Path) -> None:
+    theirs = InTheirs(spec_of(contract(tmp_path, "isaaclab"), {})[0])
+    newest = list(range(48, 96))  # of two frames, the oldest first
+    if layout == "term":
+        newest = [k for start in (0, 6, 12, 18) for k in range(start + 3, start + 6)]
+        newest += [k for start in (24, 48, 72) for k in range(start + 12, start + 24)]
+
+    class Newest(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.net = theirs
+
+        def forward(self, obs: torch.Tensor) -> torch.Tensor:
+            return self.net(obs[:, newest])
+
+    wrong = Path(contract(tmp_path, "isaaclab"))
+    wrong.write_text(f"{wrong.read_text()}history: 2\nhistory_order: newest_first\nhistory_layout: frame\n")
+    with pytest.raises(ExportError, match=f"mismatch.*history_order=oldest_first, history_layout={layout}"):
+        build_foreign(exported(Newest(), tmp_path / "policy.pt", 96), str(wrong))
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_other_contract_differs_from_the_stated_one(preset: str, tmp_path: Path) -> None:
+    file = tmp_path / "spec.yaml"
+    file.write_text(f"preset: {preset}\nhistory: 3\n")
+    spec = spec_of(str(file), {})[0]
+    others = dict(alternatives(spec))
+    assert not {f"terms, scales and joint order of preset {preset}", f"joint order: joint_order={spec.joint_order}"} & {
+        *others
+    }
+    assert "default pose: that of preset mjlab" in others or preset == "mjlab"
+    assert len([name for name in others if name.startswith("history: ")]) == 3
+    right = others["sign: joint_sign reversed (right hip)"]
+    assert dict(zip(right.names, right.joints("joint_sign"), strict=True))["FR_hip"] == -1
+    for name, other in others.items():  # a reversed joint of a robot keeps its default pose
+        if name.startswith("sign: joint_sign"):
+            poses = [one.joints("joint_sign") * one.joints("default_pose") for one in (spec, other)]
+            np.testing.assert_array_equal(*poses)
+
+
 @pytest.mark.slow(*ABOUT)
 @pytest.mark.parametrize("preset", PRESETS)
 def test_of_a_policy_that_does_nothing_no_mismatch_is_named(preset: str, tmp_path: Path) -> None:
@@ -182,6 +241,48 @@ def test_metadata_of_the_file_and_sizes(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"48 numbers .*the network takes 45"):
         build_foreign(made, "legged_gym")
     assert {name.partition(":")[0] for name, _ in alternatives(spec_of("isaaclab", {})[0])} >= {"joint order", "sign"}
+
+
+@pytest.mark.parametrize(
+    ("kinds", "shapes", "named"),
+    [
+        ((10, 1), ([1, 48], [1, 12]), "input obs is float16, 2-D; must be float32, 2-D"),
+        ((1, 11), ([1, 48], [1, 12]), "output actions is double, 2-D; must be"),
+        ((1, 1), ([48], [12]), "input obs is float, 1-D; must be"),
+    ],
+)
+def test_numbers_of_a_network_that_the_runtime_does_not_feed_are_named(
+    kinds: tuple[int, int], shapes: tuple[list[int], list[int]], named: str, tmp_path: Path
+) -> None:
+    helper = onnx.helper
+    weights = onnx.numpy_helper.from_array(np.zeros((48, 12), np.float32), "W")
+    nodes = [
+        helper.make_node("Cast", ["obs"], ["x"], to=1),
+        helper.make_node("MatMul", ["x", "W"], ["y"]),
+        helper.make_node("Cast", ["y"], ["actions"], to=kinds[1]),
+    ]
+    ports = [helper.make_tensor_value_info(*p) for p in zip(("obs", "actions"), kinds, shapes, strict=True)]
+    graph = helper.make_graph(nodes, "p", ports[:1], ports[1:], [weights])
+    file = tmp_path / "p.onnx"
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), file)
+    with pytest.raises(ExportError, match=named):
+        build_foreign(file, "isaaclab")
+
+
+def test_gains_that_the_motors_do_not_take_are_refused_before_a_simulation(tmp_path: Path) -> None:
+    file = tmp_path / "spec.yaml"
+    file.write_text("preset: isaaclab\nkp: [20.0, 5000.0, 20.0]\n")
+    with pytest.raises(ExportError, match=r"kp\.1 = 5000: must be 0 to 1023, as the gain of FR_thigh"):
+        build_foreign(exported(nn.Linear(48, 12), tmp_path / "policy.pt"), str(file))
+
+
+def test_a_script_that_returns_more_than_actions_is_named(tmp_path: Path) -> None:
+    class Two(nn.Module):
+        def forward(self, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            return obs[:, :12], obs
+
+    with pytest.raises(ExportError, match=r"policy\.pt: returns a tuple; one tensor of 12 actions is needed"):
+        build_foreign(exported(Two(), tmp_path / "policy.pt"), "isaaclab")
 
 
 def test_first_targets_are_compared_with_the_own_pose_and_limit_of_each_joint(tmp_path: Path) -> None:

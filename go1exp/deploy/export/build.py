@@ -165,28 +165,31 @@ def metadata(task: TaskConfig, inputs: tuple[Port, ...], trained: Trained) -> Me
     """Return the metadata of a task's policy, whose graph has these inputs; ``trained`` is its origin."""
     config: RobotConfig = task.robot
     observation = blocks(task.observation)
-    return Metadata(
-        robot="go1",
-        joints=robot.JOINTS,
-        legs=robot.LEGS,
-        inputs=inputs,
-        outputs=outputs(sum(block.size for block in observation)),
-        observation=observation,
-        nominal_stance=tuple(robot.NOMINAL_STANCE.tolist()),
-        action_scale=task.action.scale,
-        action_clip=task.action.clip,
-        kp=gains(task.actuator, "kp"),
-        kd=gains(task.actuator, "kd"),
-        joint_limits=tuple((float(low), float(high)) for low, high in robot.JOINT_POS_LIMITS),
-        torque_limit=tuple(robot.per_joint(config.effort_limit).tolist()),
-        velocity_limit=tuple(robot.per_joint(config.velocity_limit).tolist()),
-        policy_dt=task.sim.policy_dt,
-        physics_dt=task.sim.physics_dt,
-        command_ranges=command_ranges(task.command),
-        conventions=CONVENTIONS,
-        estimator=json.loads(to_json(go1())),
-        trained=trained,
-    )
+    try:
+        return Metadata(
+            robot="go1",
+            joints=robot.JOINTS,
+            legs=robot.LEGS,
+            inputs=inputs,
+            outputs=outputs(sum(block.size for block in observation)),
+            observation=observation,
+            nominal_stance=tuple(robot.NOMINAL_STANCE.tolist()),
+            action_scale=task.action.scale,
+            action_clip=task.action.clip,
+            kp=gains(task.actuator, "kp"),
+            kd=gains(task.actuator, "kd"),
+            joint_limits=tuple((float(low), float(high)) for low, high in robot.JOINT_POS_LIMITS),
+            torque_limit=tuple(robot.per_joint(config.effort_limit).tolist()),
+            velocity_limit=tuple(robot.per_joint(config.velocity_limit).tolist()),
+            policy_dt=task.sim.policy_dt,
+            physics_dt=task.sim.physics_dt,
+            command_ranges=command_ranges(task.command),
+            conventions=CONVENTIONS,
+            estimator=json.loads(to_json(go1())),
+            trained=trained,
+        )
+    except ValueError as error:
+        raise ExportError(str(error)) from None
 
 
 def gains(actuator: Term, name: str) -> tuple[float, ...] | None:

@@ -53,6 +53,18 @@ BETTER, STEADIER, PART, CLOSE = 0.1, 0.05, 0.5, 0.3
 sway less, m/s; which part of the stated contract's error may remain (chosen: a wrong attitude costs a quarter on flat
 ground); and how far behind the likeliest another one is named, too."""
 
+WALKING, STILL = 0.5, 0.1
+"""A contract under which the policy neither follows the commands so closely nor sways less, m/s, is not likely."""
+
+TURNED = {
+    "all": robot.JOINTS,
+    **{name: tuple(j for j in robot.JOINTS if j.endswith(f"_{name}")) for name in robot.JOINT_KINDS},
+    "right hip": ("FR_hip", "RR_hip"),
+    "left hip": ("FL_hip", "RL_hip"),
+    "thigh and calf": tuple(j for j in robot.JOINTS if not j.endswith("_hip")),
+}
+"""Joints whose direction other models have reversed together."""
+
 USUAL: dict[str, tuple[Any, ...]] = {
     "base_linear_velocity": (1.0, 2.0),
     "base_angular_velocity": (1.0, 0.25, 0.2),
@@ -184,13 +196,25 @@ def drive(
 
 def alternatives(spec: Spec) -> Iterator[tuple[str, Spec]]:
     """Yield contracts that differ from the stated one in one respect, with its name."""
+
+    def law(one: Spec) -> tuple[Any, ...]:
+        joints = (tuple(one.joints(key)) for key in ("joint_sign", "kp", "kd", "default_pose", "action_scale"))
+        return one.names, one.observation, one.history_order, one.history_layout, *joints
+
+    for name, other in _variants(spec):
+        if law(other) != law(spec):
+            yield name, other
+
+
+def _variants(spec: Spec) -> Iterator[tuple[str, Spec]]:
+    """Yield contracts that differ from the stated one in at most one respect, with its name."""
     change, scale = dataclasses.replace, spec.joints("action_scale")
     per_joint = ("kp", "kd", "default_pose", "action_scale")
     by_name = {key: dict(zip(spec.names, spec.joints(key), strict=True)) for key in per_joint}
-    for name, order in ORDERS.items():
-        if order != spec.names:
-            yield f"joint order: joint_order={name}", change(spec, joint_order=name, **by_name)
-    yield "sign: joint_sign reversed", change(spec, joint_sign=tuple(-spec.joints("joint_sign")))
+    for name in ORDERS:
+        yield f"joint order: joint_order={name}", change(spec, joint_order=name, **by_name)
+    for name, joints in TURNED.items():
+        yield f"sign: joint_sign reversed ({name})", _turned(spec, joints)
     yield "sign: action_scale reversed", change(spec, action_scale=tuple(-scale))
     for factor in (0.5, 2.0):
         yield f"scale: action_scale x {factor:g}", change(spec, action_scale=tuple(factor * scale))
@@ -201,6 +225,7 @@ def alternatives(spec: Spec) -> Iterator[tuple[str, Spec]]:
         for text, values in _other_readings(observed):
             terms = [*spec.observation[:k], change(observed, **values), *spec.observation[k + 1 :]]
             yield text, change(spec, observation=tuple(terms))
+    yield from _other_histories(spec)
     stated = dict(zip(map(_name, spec.observation), spec.observation, strict=True))
     for preset in ("isaaclab", "mjlab", "legged_gym"):
         theirs = spec_of(preset, {})[0]
@@ -209,6 +234,27 @@ def alternatives(spec: Spec) -> Iterator[tuple[str, Spec]]:
             kept = [change(o, history=stated[n].history, parameters=stated[n].parameters) for n, o in by_term.items()]
             other = change(spec, observation=tuple(kept), joint_order=theirs.joint_order, **by_name)
             yield f"terms, scales and joint order of preset {preset}", other
+
+
+def _turned(spec: Spec, joints: Sequence[str]) -> Spec:
+    """Return a contract with the sign of some joints reversed; the pose turns with them if it is beyond the stops."""
+    sign, pose = spec.joints("joint_sign"), spec.joints("default_pose")
+    reverse = np.isin(spec.names, joints)
+    low, high = robot.JOINT_POS_LIMITS[[robot.JOINTS.index(name) for name in spec.names]].T
+    kept = reverse & np.all(~reverse | ((sign * pose >= low) & (sign * pose <= high)))
+    turned = {"joint_sign": np.where(reverse, -sign, sign), "default_pose": np.where(kept, -pose, pose)}
+    return dataclasses.replace(spec, **{key: tuple(map(float, values)) for key, values in turned.items()})
+
+
+def _other_histories(spec: Spec) -> Iterator[tuple[str, Spec]]:
+    """Yield contracts with the frames in another order."""
+    frames = {observed.history or spec.history for observed in spec.observation}
+    if max(frames) == 1:
+        return
+    for layout in ("term", "frame") if len(frames) == 1 else (spec.history_layout,):
+        for order in ("newest_first", "oldest_first"):
+            text = f"history: history_order={order}, history_layout={layout}"
+            yield text, dataclasses.replace(spec, history_order=order, history_layout=layout)
 
 
 def _other_readings(observed: Observed) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -257,6 +303,7 @@ def build_foreign(file: Path, given: str, *, force: bool = False) -> tuple[bytes
         raise ConfigError(
             [f"observation: {front.size} numbers ({terms}); the network takes {network.size}{_hint(network, front)}"]
         )
+    described = metadata(config.task, front.inputs, Trained(file.name, network.sha256, 0, 0))
     with one_thread(), torch.no_grad():
         (stated,), trace, rest = drive(config, [spec], network)
         likely, alike = _likelier(stated, config, spec, network)
@@ -265,12 +312,13 @@ def build_foreign(file: Path, given: str, *, force: bool = False) -> tuple[bytes
     verdict = f"with the stated contract it {what} and {stated}"
     if likely:
         verdict += f"; likely mismatch, since it stands with: {'; '.join(likely)}"
+    elif stated.falls:
+        verdict += "; it walks under no contract that differs in one respect"
     elif alike:
         remaining = f" and {len(alike) - 5} others" if len(alike) > 5 else ""
         lines = [*lines, f"note: not checked, since it moves the same with {'; '.join(alike[:5])}{remaining}"]
     if (likely or stated.falls) and not force:
         raise ExportError(f"{file}: {verdict}; force=true imports it all the same")
-    described = metadata(config.task, front.inputs, Trained(file.name, network.sha256, 0, 0))
     data = bundle.write(described, container, versions(file.parent), model, trace)
     bundle.loads(data, str(file))
     return data, [*lines, *at_rest(spec, rest), verdict]
@@ -301,7 +349,8 @@ def _likelier(stated: Outcome, config: TrainConfig, spec: Spec, network: Network
         # stance and stiffness change how a robot sways, whatever its policy reads; a sign turns the stance, too
         read = not name.startswith(("default pose", "scale: action", "sign"))
         steadier = read and one.sways < calm and one.follows > stated.follows - STEADIER
-        if not one.falls and (one.follows > least or steadier):
+        works = not one.falls and (one.follows > WALKING or one.sways < STILL)
+        if works and (one.follows > least or steadier):
             likely.append((round(one.follows - one.sways, 2), f"{name} ({one})"))
         elif read and np.allclose((one.follows, one.sways), (stated.follows, stated.sways), rtol=0, atol=0.01):
             alike.append(name)

@@ -54,6 +54,13 @@ class Network:
         outputs = {o.name: o for o in self.model.graph.output}
         output = next((outputs[n] for n in ("actions", "action") if n in outputs), self.model.graph.output[0])
         self.input, self.output = inputs[0].name, output.name
+        for what, value in (("input", inputs[0]), ("output", output)):
+            given, rank = value.type.tensor_type, len(value.type.tensor_type.shape.dim)
+            if given.elem_type != onnx.TensorProto.FLOAT or (given.HasField("shape") and rank != 2):
+                held = onnx.TensorProto.DataType.Name(given.elem_type).lower()
+                raise ExportError(
+                    f"{file}: {what} {value.name} is {held}, {rank}-D; must be float32, 2-D (rows, numbers)"
+                )
         shape = inputs[0].type.tensor_type.shape.dim
         self.size = int(shape[-1].dim_value) if shape and shape[-1].dim_value else None
         for value in (inputs[0], *outputs.values()):
@@ -104,6 +111,8 @@ def _converted(file: Path, size: int | None) -> Any:
     try:
         with torch.no_grad(), quiet(), warnings.catch_warnings():
             wanted = script(probe)
+            if not isinstance(wanted, torch.Tensor):
+                raise ExportError(f"{file}: returns a {type(wanted).__name__}; one tensor of 12 actions is needed")
             if not torch.equal(wanted, script(probe)):
                 raise ExportError(f"{file}: gives other actions the second time: recurrent policies are not imported")
             rows = {"obs": {0: "rows"}, "actions": {0: "rows"}}
@@ -113,8 +122,8 @@ def _converted(file: Path, size: int | None) -> Any:
             )  # fmt: skip
     except ExportError:
         raise
-    except Exception as error:  # torch raises whatever the user's code and its converter do
-        reason = str(error).strip().partition("\n")[0]
+    except Exception as error:  # torch raises whatever the user's code and its converter do, the cause last
+        reason = str(error).strip().rpartition("\n")[2]
         raise ExportError(
             f"{file}: TorchScript that does not take {size} numbers or has no form in ONNX ({reason})"
         ) from None
