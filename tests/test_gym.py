@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -96,8 +97,10 @@ def test_the_action_box_is_chosen_and_ends_at_the_clip(make_core: Make) -> None:
     clipped, batch = Go1Env([*QUIET, "action.clip=1.0"]), Go1VecEnv(make_core(*QUIET), action_box=3.0)
     assert clipped.action_space == gymnasium.spaces.Box(-1.0, 1.0, (12,), np.float32)
     assert batch.action_space == gymnasium.spaces.Box(-3.0, 3.0, (12,), np.float32)
-    with pytest.raises(ConfigError, match=r"^action_box = 0.0: must be positive"):
+    with pytest.raises(ConfigError, match=r"^action_box = 0.0: must be a positive number"):
         Go1Env(QUIET, action_box=0.0)
+    with pytest.raises(ConfigError, match=r"^action_box = wide: must be a positive number"):
+        Go1Env(QUIET, action_box="wide")  # type: ignore[arg-type]
 
 
 def test_actions_drawn_uniformly_from_the_box_leave_the_robot_standing() -> None:
@@ -159,6 +162,15 @@ def test_an_action_that_is_not_finite_is_refused_by_a_batch_and_leaves_no_file(
     assert list(Path().iterdir()) == []
 
 
+@pytest.mark.parametrize("error", [NumericalFault.of("action", "at step 1"), ConfigError(["a = 1: wrong", "b: too"])])
+def test_an_error_of_a_worker_process_arrives_with_its_message(error: Exception) -> None:
+    """Gymnasium's vector of processes raises CLASS(ERROR), where ERROR has been pickled."""
+    sent = pickle.loads(pickle.dumps(error))
+    again = type(error)(sent)
+    assert str(sent) == str(again) == str(error)
+    assert getattr(again, "problems", None) == getattr(error, "problems", None)
+
+
 @pytest.mark.parametrize("group", ["reward", "rand", "terrain", "event"])
 def test_make_refuses_a_choice_as_the_command_line_does(group: str, registered: None) -> None:
     for make in (go1exp.make, partial(gymnasium.make, "Go1-v0")):
@@ -166,6 +178,8 @@ def test_make_refuses_a_choice_as_the_command_line_does(group: str, registered: 
             make(overrides=[f"{group}=nonee"])
         with pytest.raises(ConfigError, match=r"reward\.gaitt"):
             make(overrides=["+reward.gaitt={weight: 1.0}"])
+        with pytest.raises(ConfigError, match=r"^rewards: unknown key 'rewards'"):
+            make(overrides=["+rewards.gait=1"])
 
 
 def test_the_render_rate_is_that_of_the_policy() -> None:
@@ -276,6 +290,15 @@ def test_an_action_of_another_shape_is_refused(shape: tuple[int, ...]) -> None:
     env.reset(seed=0)
     with pytest.raises(ValueError, match=r"^action: has shape \(.*\); must be \(12,\)"):
         env.step(np.zeros(shape, np.float32))
+
+
+@pytest.mark.parametrize("action", [None, "still", {}, np.array([None] * 12), np.array(["0"] * 12)])
+def test_an_action_without_numbers_is_refused_by_name(action: Any, make_core: Make) -> None:
+    env = Go1Env(QUIET)
+    env.reset(seed=0)
+    for step in (env.step, quiet_batch(make_core(*QUIET)).step):
+        with pytest.raises(ValueError, match=r"^action: must be an array of numbers, not"):
+            step(action)
 
 
 # Stable-Baselines3

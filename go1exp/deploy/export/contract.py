@@ -242,8 +242,8 @@ def _turned(spec: Spec, joints: Sequence[str]) -> Spec:
     reverse = np.isin(spec.names, joints)
     low, high = robot.JOINT_POS_LIMITS[[robot.JOINTS.index(name) for name in spec.names]].T
     kept = reverse & np.all(~reverse | ((sign * pose >= low) & (sign * pose <= high)))
-    turned = {"joint_sign": np.where(reverse, -sign, sign), "default_pose": np.where(kept, -pose, pose)}
-    return dataclasses.replace(spec, **{key: tuple(map(float, values)) for key, values in turned.items()})
+    sign, pose = np.where(reverse, -sign, sign), np.where(kept, -pose, pose)
+    return dataclasses.replace(spec, joint_sign=tuple(sign.tolist()), default_pose=tuple(pose.tolist()))
 
 
 def _other_histories(spec: Spec) -> Iterator[tuple[str, Spec]]:

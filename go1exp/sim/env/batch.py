@@ -8,7 +8,7 @@ from typing import Any
 
 from go1exp.config.schema.registry import ConfigError
 from go1exp.sim.env.core import Go1Core
-from go1exp.sim.task import TaskConfig, parse_task
+from go1exp.sim.task import TaskConfig, parse_train
 
 
 def make(
@@ -25,7 +25,7 @@ def make(
     end begin anew by themselves. All tensors are on ``device`` of the result and valid until the next step.
 
     Args:
-        overrides: as after ``go1exp train``; those of the learner and the run are ignored.
+        overrides: as after ``go1exp train``; those of the learner and the run are checked and have no effect.
         num_envs: N.
         seed: of everything random.
         noise: add the configured observation noise.
@@ -42,7 +42,7 @@ def task_of(overrides: Any) -> TaskConfig:
     """Return the task of ``go1exp train`` with overrides; raise ConfigError, as the command line does."""
     from go1exp.config.compose import compose_checked
 
-    return parse_task(compose_checked("train", listed(overrides)))
+    return parse_train(compose_checked("train", listed(overrides))).task
 
 
 def whole(name: str, value: Any, least: int) -> int:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Self
 
 import numpy as np
 import torch
@@ -19,9 +21,17 @@ class NumericalFault(Expected):
         dump: arrays that describe the moment, to be saved in the run folder.
     """
 
-    def __init__(self, quantity: str, where: str, dump: Mapping[str, np.ndarray]) -> None:
+    def __init__(
+        self, message: object, quantity: str = "", dump: Mapping[str, np.ndarray] = MappingProxyType({})
+    ) -> None:
+        """Take the message alone, too: so Gymnasium passes errors on from its worker processes."""
         self.quantity, self.dump = quantity, dict(dump)
-        super().__init__(f"{quantity} is not finite {where}")
+        super().__init__(str(message))
+
+    @classmethod
+    def of(cls, quantity: str, where: str, dump: Mapping[str, np.ndarray] = MappingProxyType({})) -> Self:
+        """Return the fault of a quantity at a moment, such as ``in environment 3 at step 7``."""
+        return cls(f"{quantity} is not finite {where}", quantity, dump)
 
 
 def accuse(named: Mapping[str, Tensor], steps: Tensor) -> None:
@@ -36,7 +46,7 @@ def accuse(named: Mapping[str, Tensor], steps: Tensor) -> None:
         if bad.any():
             env = int(bad.nonzero()[0])
             dump = {key: value[env].cpu().numpy() for key, value in named.items()}
-            raise NumericalFault(name, f"in environment {env} at step {int(steps[env])}", dump)
+            raise NumericalFault.of(name, f"in environment {env} at step {int(steps[env])}", dump)
 
 
 class Evidence:

@@ -12,7 +12,7 @@ import torch
 
 from go1exp.sim.env.batch import make, task_of, whole
 from go1exp.sim.env.core import Go1Core
-from go1exp.sim.env.sb3_env import spaces
+from go1exp.sim.env.sb3_env import action_tensor, spaces
 from go1exp.sim.task import TaskConfig
 
 ACTION_BOX = 2.0
@@ -34,7 +34,7 @@ class Go1Env(gym.Env[np.ndarray, np.ndarray]):
     an episode ends ``episode_end``: the key of the termination that was true, ``left the map`` or ``time limit``.
 
     Args:
-        overrides: as after ``go1exp train``; those of the learner and the run are ignored.
+        overrides: as after ``go1exp train``; those of the learner and the run are checked and have no effect.
         task: a parsed configuration in their place.
         noise: add the configured observation noise.
         env_index: behave like this environment of a batch with the same seed, in the first episode.
@@ -44,7 +44,7 @@ class Go1Env(gym.Env[np.ndarray, np.ndarray]):
 
     Raises:
         go1exp.config.schema.registry.ConfigError: if an override does not fit.
-        ValueError: from ``step`` for an action of another shape.
+        ValueError: from ``step`` for an action of another shape, or without numbers.
         go1exp.sim.env.faults.NumericalFault: from ``step`` when a value is not finite.
     """
 
@@ -76,7 +76,7 @@ class Go1Env(gym.Env[np.ndarray, np.ndarray]):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Apply an action (12,) for one policy period."""
-        given = torch.as_tensor(action, dtype=torch.float32)
+        given = action_tensor(action, self.core.device)
         if given.shape != self.action_space.shape:
             raise ValueError(f"action: has shape {tuple(given.shape)}; must be {self.action_space.shape}")
         result = self.core.step(given.unsqueeze(0))
@@ -112,7 +112,7 @@ class Go1VectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     Args:
         num_envs: N.
-        overrides: as after ``go1exp train``; those of the learner and the run are ignored.
+        overrides: as after ``go1exp train``; those of the learner and the run are checked and have no effect.
         noise: add the configured observation noise.
         action_box: as of ``Go1Env``.
 
@@ -140,7 +140,7 @@ class Go1VectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Apply actions (N, 12) for one policy period."""
-        result = self.core.step(torch.as_tensor(actions, dtype=torch.float32, device=self.core.device))
+        result = self.core.step(action_tensor(actions, self.core.device))
         self.core.check(result)
         flags = result.terminated, result.truncated
         observation, reward, terminated, truncated = (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from numbers import Real
 from typing import Any
 
 import gymnasium as gym
@@ -27,13 +28,23 @@ def spaces(core: Go1Core, action_box: float | None = None) -> tuple[gym.spaces.B
     Raises:
         ConfigError: if ``action_box`` is not positive.
     """
-    clip = core.task.action.clip if action_box is None else min(action_box, core.task.action.clip)
+    clip = core.task.action.clip
+    if action_box is not None:
+        clip = min(action_box, clip) if isinstance(action_box, Real) else 0.0
     if not clip > 0.0:
-        raise ConfigError([f"action_box = {action_box}: must be positive, in units of action.scale"])
+        raise ConfigError([f"action_box = {action_box}: must be a positive number, in units of action.scale"])
     return (
         gym.spaces.Box(-np.inf, np.inf, (core.observation_size,), np.float32),
         gym.spaces.Box(-clip, clip, (robot.NUM_JOINTS,), np.float32),
     )
+
+
+def action_tensor(actions: Any, device: torch.device) -> torch.Tensor:
+    """Return actions as a tensor; raise ValueError if they are not numbers."""
+    try:
+        return torch.as_tensor(actions, dtype=torch.float32, device=device)
+    except (TypeError, ValueError, RuntimeError):
+        raise ValueError(f"action: must be an array of numbers, not {type(actions).__name__} {actions!r:.80}") from None
 
 
 class Go1VecEnv(VecEnv):
@@ -64,7 +75,7 @@ class Go1VecEnv(VecEnv):
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keep the actions (N, 12) for ``step_wait``."""
-        self._actions = torch.as_tensor(actions, dtype=torch.float32, device=self.core.device)
+        self._actions = action_tensor(actions, self.core.device)
 
     def step_wait(self) -> VecEnvStepReturn:
         """Advance one policy step."""
