@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
 import torch
 
+from benchmarks.ship_policy import refuse_changes
 from go1exp.cli import subjects
 from go1exp.cli.places import shipped_policies, trained
 from go1exp.config.compose import compose
@@ -23,6 +25,25 @@ NAMES = sorted(shipped_policies())
 
 def test_there_are_the_papers_and_one_that_trots() -> None:
     assert {"clock", "paper", "robust", "robust_history"} <= set(NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_page_of_a_policy_names_the_commit_of_its_record(name: str) -> None:
+    folder = shipped_policies()[name]
+    page, record = (folder / "README.md").read_text(), json.loads((folder / "meta.json").read_text())
+    assert re.findall(r"commit\s+([0-9a-f]{7,40})", page) == [record["git"][:7]]
+    assert ("uncommitted changes" in page) == record["git_dirty"]
+
+
+def test_a_policy_of_changed_files_is_not_shipped(tmp_path: Path) -> None:
+    (tmp_path / "meta.json").write_text('{"git_dirty": false}')
+    refuse_changes("e1471f9", [tmp_path])
+    for present in ("e1471f9+", "unknown"):
+        with pytest.raises(SystemExit, match=r"commit them first"):
+            refuse_changes(present, [])
+    (tmp_path / "meta.json").write_text('{"git_dirty": true}')
+    with pytest.raises(SystemExit, match=r"files that differ from its commit"):
+        refuse_changes("e1471f9", [tmp_path])
 
 
 @pytest.mark.parametrize("name", NAMES)
