@@ -162,10 +162,10 @@ def test_joints_of_one_side_that_are_reversed_are_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize("layout", ["term", "frame"])
 def test_frames_in_another_order_are_named(layout: str, tmp_path: Path) -> None:
     theirs = InTheirs(spec_of(contract(tmp_path, "isaaclab"), {})[0])
-    newest = list(range(48, 96))  # of two frames, the oldest first
+    newest = list(range(96, 144))  # of three frames, the oldest first
     if layout == "term":
-        newest = [k for start in (0, 6, 12, 18) for k in range(start + 3, start + 6)]
-        newest += [k for start in (24, 48, 72) for k in range(start + 12, start + 24)]
+        newest = [k for start in (0, 9, 18, 27) for k in range(start + 6, start + 9)]
+        newest += [k for start in (36, 72, 108) for k in range(start + 24, start + 36)]
 
     class Newest(nn.Module):
         def __init__(self) -> None:
@@ -176,9 +176,9 @@ def test_frames_in_another_order_are_named(layout: str, tmp_path: Path) -> None:
             return self.net(obs[:, newest])
 
     wrong = Path(contract(tmp_path, "isaaclab"))
-    wrong.write_text(f"{wrong.read_text()}history: 2\nhistory_order: newest_first\nhistory_layout: frame\n")
+    wrong.write_text(f"{wrong.read_text()}history: 3\nhistory_order: newest_first\nhistory_layout: frame\n")
     with pytest.raises(ExportError, match=f"mismatch.*history_order=oldest_first, history_layout={layout}"):
-        build_foreign(exported(Newest(), tmp_path / "policy.pt", 96), str(wrong))
+        build_foreign(exported(Newest(), tmp_path / "policy.pt", 144), str(wrong))
 
 
 @pytest.mark.parametrize("preset", PRESETS)
