@@ -162,7 +162,9 @@ def test_an_action_that_is_not_finite_is_refused_by_a_batch_and_leaves_no_file(
     assert list(Path().iterdir()) == []
 
 
-@pytest.mark.parametrize("error", [NumericalFault.of("action", "at step 1"), ConfigError(["a = 1: wrong", "b: too"])])
+@pytest.mark.parametrize(
+    "error", [NumericalFault.not_finite("action", "at step 1"), ConfigError(["a = 1: wrong", "b: too"])]
+)
 def test_an_error_of_a_worker_process_arrives_with_its_message(error: Exception) -> None:
     """Gymnasium's vector of processes raises CLASS(ERROR), where ERROR has been pickled."""
     sent = pickle.loads(pickle.dumps(error))

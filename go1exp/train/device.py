@@ -132,7 +132,7 @@ class DevicePPO(AdaptivePPO):
         self._n_updates += self.n_epochs
         self._kl = figures.pop("kl")
         if not all(figures.pop("finite")):
-            raise NumericalFault.of("gradient of the policy", f"in iteration {self.iteration + 1}")
+            raise NumericalFault.not_finite("gradient of the policy", f"in iteration {self.iteration + 1}")
         self._report(figures)
         self._close_iteration()
 

@@ -259,7 +259,7 @@ class AdaptivePPO(PPO):
     def _check_gradient(self, name: str, parameter: Tensor) -> None:
         """Raise NumericalFault if the gradient that just arrived is not finite."""
         if parameter.grad is not None and not torch.isfinite(parameter.grad.sum()):
-            raise NumericalFault.of(f"gradient of policy.{name}", f"in iteration {self.iteration + 1}")
+            raise NumericalFault.not_finite(f"gradient of policy.{name}", f"in iteration {self.iteration + 1}")
 
     def _steer(self, divergence: float) -> None:
         """Note the divergence before the gradient step that is about to be taken, and set the rate of that step."""

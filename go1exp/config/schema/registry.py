@@ -92,7 +92,6 @@ class ConfigError(ValueError):
     """Things wrong with a configuration; the message has one line for each, starting with its key path."""
 
     def __init__(self, problems: Iterable[str] | Exception) -> None:
-        """Take the lines, or their text or error, from which other processes make a copy."""
         self.problems = str(problems).split("\n") if isinstance(problems, str | Exception) else list(problems)
         super().__init__("\n".join(self.problems))
 

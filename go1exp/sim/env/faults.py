@@ -29,7 +29,7 @@ class NumericalFault(Expected):
         super().__init__(str(message))
 
     @classmethod
-    def of(cls, quantity: str, where: str, dump: Mapping[str, np.ndarray] = MappingProxyType({})) -> Self:
+    def not_finite(cls, quantity: str, where: str, dump: Mapping[str, np.ndarray] = MappingProxyType({})) -> Self:
         """Return the fault of a quantity at a moment, such as ``in environment 3 at step 7``."""
         return cls(f"{quantity} is not finite {where}", quantity, dump)
 
@@ -46,7 +46,7 @@ def accuse(named: Mapping[str, Tensor], steps: Tensor) -> None:
         if bad.any():
             env = int(bad.nonzero()[0])
             dump = {key: value[env].cpu().numpy() for key, value in named.items()}
-            raise NumericalFault.of(name, f"in environment {env} at step {int(steps[env])}", dump)
+            raise NumericalFault.not_finite(name, f"in environment {env} at step {int(steps[env])}", dump)
 
 
 class Evidence:
