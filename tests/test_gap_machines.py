@@ -506,6 +506,14 @@ def test_a_base_without_a_joint_remains_a_body(tmp_path: Path, name: str, text: 
     assert [model.body(k).name for k in range(model.nbody)] == ["world", "trunk", "arm"]
 
 
+def test_a_joint_that_mimics_another_is_held(tmp_path: Path) -> None:
+    finger = f'<link name="finger">{LINK}</link><joint name="mimic" type="revolute"><parent link="arm_link"/>'
+    finger += '<child link="finger"/><axis xyz="0 1 0"/><mimic joint="arm" multiplier="0.1"/></joint></robot>'
+    (tmp_path / "arm.urdf").write_text(URDF.format(visual="").replace("</robot>", finger))
+    model = build_fixed_base(tmp_path / "arm.urdf", "base_link", ["arm"], [2.0], 0.001)
+    assert (model.njnt, model.neq) == (1, 0)
+
+
 def test_a_mesh_that_is_missing_is_named_in_one_line(tmp_path: Path) -> None:
     mesh = '<collision><geometry><mesh filename="meshes/link.stl"/></geometry></collision>'
     (tmp_path / "arm.urdf").write_text(URDF.format(visual=mesh))
