@@ -57,14 +57,14 @@ def made(folder: Path, episode: str, rows: int, kp: float = 20.0) -> Path:
 def test_a_file_in_place_of_recordings_an_answer_or_options_is_called_one(run: Run, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("<xml>no key</xml>")
     status, err = run("gap", "logs=notes.txt")
-    assert status == 1
+    assert status == 2
     assert err.startswith("go1exp gap: notes.txt: not a whole Parquet file (")
     assert err.endswith("; a log of another format becomes a recording by go1exp record import\n")
     said = "notes.txt: is a file; out must be the folder of an answer, with verdict.json"
-    assert run("gap", "report", "out=notes.txt") == (1, f"go1exp gap: {said}\n")
+    assert run("gap", "report", "out=notes.txt") == (2, f"go1exp gap: {said}\n")
     (tmp_path / "verdict.json").write_text("{}")
     said = "verdict.json: not a result of go1exp gap (has no 'verdict'); run go1exp gap explain again"
-    assert run("gap", "report", "out=.") == (1, f"go1exp gap: {said}\n")
+    assert run("gap", "report", "out=.") == (2, f"go1exp gap: {said}\n")
     status, err = run("record", "import", "csv", "notes.txt", "options=notes.txt")
     assert (status, err.startswith("go1exp record import: options=notes.txt: must be a mapping")) == (2, True), err
     (tmp_path / "log.csv").write_text("t,q,qt\n" + "".join(f"{k / 100},0.1,0.2\n" for k in range(9)))
@@ -94,6 +94,9 @@ def test_windows_that_do_not_fit_are_told_by_what_is_in_the_way(
         cut([log], GapSettings(**settings))  # type: ignore[arg-type]
 
 
+LEADS_BACK = "cannot be read (an alias leads back to itself, or there are more than 100,000 values)"
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
     [
@@ -102,6 +105,10 @@ def test_windows_that_do_not_fit_are_told_by_what_is_in_the_way(
         (b"# nothing but a remark\n", "is empty; without any, use effect=none"),
         (b"coulomb:\n  bound: [0.1\n  x: 2\n", "no YAML (line 3: expected ',' or ']', but got ':')"),
         (b"- coulomb\n", "must be a mapping, as the files of conf/effect are"),
+        (b"5\n", "cannot be read (must be a mapping)"),
+        (b"a: " + b"{a: " * 3000 + b"1" + b"}" * 3000, "cannot be read (nests too deeply)"),
+        (b"coulomb: &a\n  bound: *a\n", LEADS_BACK),
+        (b"a0: &a0 [1]\n" + b"".join(b"a%d: &a%d [*a%d,*a%d]\n" % (k + 1, k + 1, k, k) for k in range(40)), LEADS_BACK),
     ],
 )
 def test_an_effect_file_that_is_none_is_refused_by_name_and_line(
@@ -249,6 +256,16 @@ def test_an_effect_file_may_be_called_anything(given: str, tmp_path: Path) -> No
     file.write_text("coulomb: {bound: 0.3}\n")
     chosen = choices_from_files([given.format(file).replace("+", "")], "train")
     assert compose("train", chosen)["effect"]["coulomb"] == {"bound": 0.3}
+
+
+@pytest.mark.parametrize("name", ["1", "1e5", "nan", "null", "true"])
+def test_a_file_whose_name_is_a_value_to_hydra_is_taken(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path(f"{name}.yaml").write_text("coulomb: {bound: 0.3}\n")
+    for given in (f"effect={name}.yaml", f"effect=[{name}.yaml,payload]"):
+        assert compose("train", choices_from_files([given], "train"))["effect"]["coulomb"] == {"bound": 0.3}
 
 
 # ---------------------------------------------------------------------- Python

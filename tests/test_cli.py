@@ -234,6 +234,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("fit-actuator recordings=nowhere holdout=[a] validation=[a,b]", ("validation: a cannot be held out too\n",)),
         ("eval policy=paper grid.cross=true grid.x=[]", ("grid: with cross=true every axis needs at least one value",)),
         ("train seed=4294967296", ("seed = 4294967296", "4294967295")),
+        ("train reward=[1]", ("reward=[1]: a group takes the name of one of its files, such as reward=paper",)),
         ("trian seed=1", ("unknown verb 'trian'", "did you mean 'train'?")),
         ("eval", ("run: required",)),
         ("play seconds=3", ("run: required",)),
@@ -543,7 +544,7 @@ def test_a_recording_is_made_imported_audited_and_refused(tmp_path: Path) -> Non
     assert "note: " in done.stdout
     file.write_bytes(file.read_bytes()[:1000])
     done = cli(tmp_path, "record", "audit", "logs")
-    assert done.returncode == 1
+    assert done.returncode == 2
     assert re.fullmatch(r"go1exp record audit: logs/\S+\.parquet: .*\n", done.stderr), done.stderr
 
 

@@ -20,9 +20,11 @@ from go1exp.base.errors import AUDIT, DOES_NOT_HOLD, EXIT_CODES, FAULTS, NOT_SEP
 from go1exp.cli import app, helptext
 from go1exp.config.schema.registry import ConfigError
 from go1exp.deploy.runtime import walk
+from go1exp.deploy.runtime.bundle import BundleError
 from go1exp.deploy.runtime.launch import RefusedError
 from go1exp.deploy.runtime.safety import RULES
 from go1exp.logs.recording import RecordingError
+from go1exp.train.checkpoint import DamagedCheckpoint
 from tests.command import environment, refuse
 from tests.small_run import small
 from tests.test_readme import reference
@@ -49,12 +51,16 @@ def test_the_table_of_the_method_is_that_of_the_verb() -> None:
         (ConfigError(["a = 1: wrong"]), 2, "a = 1: wrong"),
         (ConfigError(["a", "b"]), 2, "2 problems\n  a\n  b"),
         (RefusedError(["a", "b"]), 2, "2 problems\n  a\n  b"),
-        (RecordingError("x: damaged"), 1, "x: damaged"),
-        (RecordingError("x: no such file", status=errors.REFUSED), 2, "x: no such file"),
+        (RecordingError("x: damaged"), 2, "x: damaged"),
+        (DamagedCheckpoint("x: damaged"), 2, "x: damaged"),
+        (BundleError("x: damaged"), 2, "x: damaged"),
         (OSError(errno.ENOSPC, "No space left on device"), 1, "No space left on device"),
         (OSError(errno.EIO, "Input/output error", "a.zip"), 1, "Input/output error: a.zip"),
         (FileNotFoundError(errno.ENOENT, "No such file or directory", b"a.zip"), 2, "No such file or directory: a.zip"),
         (PermissionError(errno.EACCES, "Permission denied", Path("a")), 2, "Permission denied: a"),
+        (FileNotFoundError("a: not a run folder"), 2, "a: not a run folder"),
+        (OSError(errno.EROFS, "Read-only file system", "a\nb\x1b"), 2, r"Read-only file system: a\nb\x1b"),
+        (ConfigError(["a\nb = 1: wrong"]), 2, r"a\nb = 1: wrong"),
         (MemoryError(), 1, "out of memory"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory"), 1, "out of memory: DefaultCPUAllocator: can't"),
         (KeyboardInterrupt(), 130, "stopped"),
@@ -122,9 +128,14 @@ def test_a_wrong_term_of_a_user_is_named(body: str, status: int, said: str, tmp_
 def test_choices_of_ones_own_that_are_no_yaml_or_lead_back_are_refused_by_file(tmp_path: Path) -> None:
     folder = tmp_path / "own/reward"
     folder.mkdir(parents=True)
-    contents = {"broken": b"gait: [1", "latin": b"a: \xe9", "number": b"5"}
+    contents = {"broken": b"gait: [1", "latin": b"a: \xe9", "number": b"5", "alias": b"a: &a [*a]"}
     contents |= {"itself": b"defaults: [itself]", "one": b"defaults: [other]", "other": b"defaults: [one]"}
-    said = {"broken": "no YAML (line ", "latin": "not UTF-8", "number": "must be a mapping"}
+    said = {
+        "broken": "no YAML (line ",
+        "latin": "not UTF-8",
+        "number": "must be a mapping",
+        "alias": "an alias leads back",
+    }
     for name, content in contents.items():
         (folder / f"{name}.yaml").write_bytes(content)
     for name in contents:

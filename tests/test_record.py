@@ -288,7 +288,7 @@ def test_a_recording_can_be_audited_and_a_damaged_one_is_named(tmp_path: Path) -
     assert file.name in done.stdout
     (tmp_path / "another.parquet").write_bytes(file.read_bytes()[:2000])
     done = refuse(tmp_path, "record", "audit", ".")
-    assert done.returncode == 1
+    assert done.returncode == 2
     assert "another.parquet: not a whole Parquet file" in done.stderr
     assert file.name in done.stdout  # the other one is judged all the same
 

@@ -6,6 +6,7 @@ Every room uses this, also the runtime on the robot: it imports nothing but the 
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import sys
 import tempfile
@@ -69,6 +70,11 @@ class Expected(RuntimeError):
         self.status = status
 
 
+UNUSABLE = (FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError)
+NO_SUCH_PLACE = (errno.EROFS, errno.ELOOP, errno.ENAMETOOLONG)
+"""What a system says of a path that cannot be used, by class and, where there is none, by number."""
+
+
 def explained(error: BaseException) -> tuple[int, str] | None:
     """Return exit status and message of an error that is an answer; None of a fault of the program.
 
@@ -76,7 +82,7 @@ def explained(error: BaseException) -> tuple[int, str] | None:
     """
     problems = getattr(error, "problems", None)
     if problems:
-        lines = list(map(str, problems))
+        lines = [_in_a_line(str(problem)) for problem in problems]
         return REFUSED, lines[0] if len(lines) == 1 else "\n  ".join([f"{len(lines)} problems", *lines])
     if isinstance(error, KeyboardInterrupt):
         return STOPPED, "stopped"
@@ -85,16 +91,30 @@ def explained(error: BaseException) -> tuple[int, str] | None:
     if isinstance(error, Expected):
         return error.status, str(error)
     if isinstance(error, OSError):
-        unusable = (FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError)
         reason = error.strerror or str(error)
         return (
-            REFUSED if isinstance(error, unusable) else FAILED,
-            reason if error.filename is None else f"{reason}: {os.fsdecode(error.filename)}",
+            REFUSED if isinstance(error, UNUSABLE) or error.errno in NO_SUCH_PLACE else FAILED,
+            reason if error.filename is None else f"{reason}: {_in_a_line(os.fsdecode(error.filename))}",
         )
+    if isinstance(error, RuntimeError) and str(error).startswith("Symlink loop from "):  # pathlib's, until Python 3.13
+        return REFUSED, str(error)
     of_torch = type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in str(error)
     if isinstance(error, MemoryError) or of_torch:
         return FAILED, f"out of memory: {' '.join(str(error).split())}".rstrip(": ")
     return None
+
+
+class Unusable(Expected):
+    """Base of errors of a file that cannot be used."""
+
+    def __init__(self, *args: object, status: int = REFUSED) -> None:
+        """Set message and status."""
+        super().__init__(*args, status=status)
+
+
+def _in_a_line(text: str) -> str:
+    """Return a text without line breaks and the like, which names of files may have."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def fault(error: BaseException) -> str:

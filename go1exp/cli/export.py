@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
+from go1exp.base.errors import Expected
 from go1exp.base.files import write_bytes
 from go1exp.cli.app import App, parse, spinner
 from go1exp.cli.places import checkpoint_file, trained, writable
@@ -88,10 +89,13 @@ def _check(container: dict[str, Any]) -> None:
 
     from rich.console import Console
 
-    from go1exp.deploy.runtime.bundle import load
+    from go1exp.deploy.runtime.bundle import BundleError, load
     from go1exp.deploy.runtime.job import refuse_unfit
 
-    bundle = load(Path(settings.file))
+    try:
+        bundle = load(Path(settings.file))
+    except BundleError as error:
+        raise Expected(str(error)) from None  # the answer of this verb, not a refusal of its setting
     refuse_unfit(bundle)
     width = None if sys.stdout.isatty() else WIDTH
     console = Console(width=width, highlight=False, emoji=False, markup=False, soft_wrap=False)

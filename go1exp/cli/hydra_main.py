@@ -270,6 +270,11 @@ def _free_name(group: str, path: Path) -> str:
     name = re.sub(r"\W", "_", str(path.with_suffix("")), flags=re.ASCII)  # else Hydra's grammar refuses it
     shipped = choice_files(group, [config_folder()])
     stored = stored_choices(group)
-    while name in shipped or stored.get(name, str(path)) != str(path):
+    parser = OverridesParser.create()  # a name such as 1 or null is none to Hydra
+    while (
+        name in shipped
+        or stored.get(name, str(path)) != str(path)
+        or not isinstance(parser.parse_override(f"{group}={name}").value(), str)
+    ):
         name += "_file"
     return name

@@ -11,7 +11,6 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from go1exp.base.errors import REFUSED
 from go1exp.base.paths import data_root
 from go1exp.config.schema.registry import ConfigError, unknown_name
 
@@ -79,7 +78,7 @@ def files_of(places: str | Sequence[str]) -> list[Path]:
     for path in map(Path, [places] if isinstance(places, str) else places):
         inside = sorted(path.glob("*.parquet"))
         if path.is_dir() and not inside:
-            raise RecordingError(f"{path}: no *.parquet in it", status=REFUSED)
+            raise RecordingError(f"{path}: no *.parquet in it")
         files += inside if path.is_dir() else [path]
     return files
 

@@ -287,7 +287,7 @@ def _audit(container: dict[str, Any]) -> int:
         counts = Counter(report["verdict"] for report in reports.values())
         print(f"{len(files)} recordings: {', '.join(f'{n} {verdict}' for verdict, n in counts.items())}")
     if unreadable:  # the others have been audited
-        raise RecordingError("\n".join(map(str, unreadable)), status=max(error.status for error in unreadable))
+        raise RecordingError("\n".join(map(str, unreadable)))
     return status
 
 

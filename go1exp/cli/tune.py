@@ -50,7 +50,7 @@ def _tune(container: dict[str, Any]) -> int | None:
     settings = parse(TuneSettings, container)
     ranges = _ranges(settings.space)
     if importlib.util.find_spec("optuna") is None:
-        raise ConfigError(["go1exp tune needs the package optuna: pip install 'go1exp[tune]'"])
+        raise ConfigError(["needs the package optuna: pip install 'go1exp[tune]'"])
 
     from go1exp.config.schema.training import EVALUATED
 

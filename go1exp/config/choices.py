@@ -103,7 +103,32 @@ def about(file: Path) -> str:
     return " ".join(comments).split(". ")[0].rstrip(".")
 
 
-UNREADABLE = (UnicodeDecodeError, YAMLError, OSError)
+MOST_VALUES = 100_000
+"""In a YAML file, each alias written out."""
+
+
+def content_of(text: str, loader: Any) -> Any:
+    """Return the content of a YAML text, {} of an empty one; raise YAMLError of one that OmegaConf cannot take."""
+    content = yaml.load(text, Loader=loader)
+    if content is not None and not isinstance(content, dict | list | str):
+        raise YAMLError("must be a mapping")
+    if _written_out(content, {}) > MOST_VALUES:
+        raise YAMLError(f"an alias leads back to itself, or there are more than {MOST_VALUES:,} values")
+    return {} if content is None else content
+
+
+def _written_out(content: Any, known: dict[int, int]) -> int:
+    """Return how many values there are when every alias is written out; too many where one leads back."""
+    if not isinstance(content, dict | list):
+        return 1
+    if id(content) not in known:
+        known[id(content)] = MOST_VALUES + 1
+        inside = content.values() if isinstance(content, dict) else content
+        known[id(content)] = 1 + sum(_written_out(value, known) for value in inside)
+    return known[id(content)]
+
+
+UNREADABLE = (UnicodeDecodeError, YAMLError, OSError, RecursionError)
 """What reading a YAML file raises."""
 
 
@@ -114,5 +139,7 @@ def why_unreadable(error: Exception) -> str:
     if isinstance(error, MarkedYAMLError):
         mark = error.problem_mark or error.context_mark
         return f"no YAML ({f'line {mark.line + 1}: ' if mark else ''}{error.problem})"
+    if isinstance(error, RecursionError):
+        return "cannot be read (nests too deeply)"
     why = error.strerror if isinstance(error, OSError) else str(error).splitlines()[0]
     return f"cannot be read ({why})"

@@ -42,7 +42,16 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.basecontainer import get_yaml_loader
 from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseException
 
-from go1exp.config.choices import FOLDERS, UNREADABLE, config_folder, folder_of, groups_of, hidden_from, why_unreadable
+from go1exp.config.choices import (
+    FOLDERS,
+    UNREADABLE,
+    config_folder,
+    content_of,
+    folder_of,
+    groups_of,
+    hidden_from,
+    why_unreadable,
+)
 from go1exp.config.schema.registry import ConfigError
 
 OLD = hydra.__version__ < "1.4"
@@ -52,7 +61,7 @@ MAIN: dict[str, Any] = (
 )
 """Arguments of ``hydra.main`` that depend on its version."""
 
-REFUSED = (HydraException, OmegaConfBaseException, RecursionError, ValueError)
+REFUSED = (HydraException, OmegaConfBaseException, RecursionError, TypeError, ValueError)
 """What composing raises where an override or a file does not fit."""
 
 GRAMMAR = re.compile(r"See https://hydra\.cc/docs/\S+/basic for details")
@@ -62,12 +71,9 @@ GRAMMAR = re.compile(r"See https://hydra\.cc/docs/\S+/basic for details")
 
 
 def read_yaml(file: Path, resolve: bool = False) -> Any:
-    """Return the content of a YAML file as plain data, by OmegaConf's rules (``1e3`` is a number).
-
-    Raises:
-        yaml.YAMLError, UnicodeDecodeError, OSError: if the file cannot be read.
-    """
-    return OmegaConf.to_container(OmegaConf.load(file), resolve=resolve)
+    """Return the content of a YAML file as plain data, ``1e3`` a number, as OmegaConf does; raise ``UNREADABLE``."""
+    content = content_of(file.read_text(encoding="utf-8"), get_yaml_loader())
+    return OmegaConf.to_container(OmegaConf.create(content), resolve=resolve)
 
 
 def to_yaml(container: Mapping[str, Any]) -> str:
@@ -112,11 +118,7 @@ def _fast_loader() -> Any:
 def _pickled(file: Path, mtime_ns: int, size: int) -> bytes:
     """Return a file's content and header, pickled, as long as the file does not change."""
     try:
-        text = file.read_text(encoding="utf-8")
-        content = yaml.load(text, Loader=_fast_loader())
-        if content is not None and not isinstance(content, dict | list | str):
-            raise ConfigError([f"{file}: must be a mapping"])
-        config = OmegaConf.create({} if content is None else content)
+        config = OmegaConf.create(content_of(text := file.read_text(encoding="utf-8"), _fast_loader()))
     except UNREADABLE as error:
         raise ConfigError([f"{file}: {why_unreadable(error)}"]) from None
     return pickle.dumps((config, FileConfigSource._get_header_dict(text[:512])))

@@ -13,10 +13,9 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from go1exp.base.errors import REFUSED
+from go1exp.base.errors import Unusable
 from go1exp.base.files import write_json
 from go1exp.config.schema.physics import ContactConfig, read_contact
-from go1exp.config.schema.registry import Expected
 from go1exp.gap.result import GapResult, GapSettings
 
 RESULT = "verdict.json"  # name of the file in the output folder
@@ -30,7 +29,7 @@ MADE_OF_IT = (EFFECT, CALIBRATION, COMPENSATING, APPLIED, "report.html", "report
 """Files that are made of a result, beside it."""
 
 
-class GapFileError(Expected):
+class GapFileError(Unusable):
     """A result file that is missing or not whole."""
 
 
@@ -56,7 +55,7 @@ def load(folder: Path) -> GapResult:
     if folder.is_file():
         raise GapFileError(f"{folder}: is a file; out must be the folder of an answer, with {RESULT}")
     if not path.is_file():
-        raise GapFileError(f"{path}: no such file; run go1exp gap explain first", status=REFUSED)
+        raise GapFileError(f"{path}: no such file; run go1exp gap explain first")
     try:
         return from_dict(json.loads(path.read_text()))
     except (KeyError, TypeError, ValueError, AttributeError) as error:

@@ -33,11 +33,11 @@ import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from go1exp.base.errors import REFUSED
+from go1exp.base.errors import Unusable
 from go1exp.base.files import opened
 from go1exp.base.wording import counted
 from go1exp.config.schema.physics import ContactConfig
-from go1exp.config.schema.registry import STRICT, Expected, NonNegative, Positive, explain, nearest
+from go1exp.config.schema.registry import STRICT, NonNegative, Positive, explain, nearest
 from go1exp.robot import JOINTS, LEGS
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ Joint = Annotated[str, Field(min_length=1)]
 Quaternion = tuple[float, float, float, float]
 
 
-class RecordingError(Expected):
+class RecordingError(Unusable):
     """A recording that breaks the format. The message starts with the file (or episode) and names the channel."""
 
 
@@ -288,7 +288,7 @@ def read(path: Path) -> Recording:
 
     path = Path(path)
     if not path.is_file():
-        raise RecordingError(f"{path}: no such file", status=REFUSED)
+        raise RecordingError(f"{path}: no such file")
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             text = (file.metadata.metadata or {}).get(KEY)
@@ -355,7 +355,5 @@ def read_folder(path: Path) -> list[Recording]:
     path = Path(path)
     files = sorted(path.glob("*.parquet"))
     if not files:
-        raise RecordingError(
-            f"{path}: no *.parquet in it" if path.is_dir() else f"{path}: no such folder", status=REFUSED
-        )
+        raise RecordingError(f"{path}: no *.parquet in it" if path.is_dir() else f"{path}: no such folder")
     return [read(file) for file in files]

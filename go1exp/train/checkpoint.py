@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from go1exp.base.errors import Expected
+from go1exp.base.errors import Unusable
 from go1exp.base.files import opened
 from go1exp.train.ppo import AdaptivePPO
 
@@ -28,7 +28,7 @@ ROBOTS = ("env", "last_obs", "last_episode_starts")
 """Parts of a checkpoint that belong to the robots; of several GPUs, each has its own."""
 
 
-class DamagedCheckpoint(Expected):
+class DamagedCheckpoint(Unusable):
     """A checkpoint that is not whole, or none at all; the message names the file."""
 
 

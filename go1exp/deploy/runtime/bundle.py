@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from go1exp.base.errors import Expected
+from go1exp.base.errors import Unusable
 from go1exp.deploy.runtime.metadata import Metadata, Port
 from go1exp.deploy.runtime.policy import OnnxPolicy
 
@@ -29,7 +29,7 @@ MANIFEST = "manifest.json"
 FORMAT = 1
 
 
-class BundleError(Expected):
+class BundleError(Unusable):
     """An invalid bundle; the message names the file, the member and the problem."""
 
 

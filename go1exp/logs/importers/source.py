@@ -15,7 +15,6 @@ import numpy as np
 from pydantic import ValidationError
 
 from go1exp import __version__
-from go1exp.base.errors import REFUSED
 from go1exp.base.wording import counted
 from go1exp.config.schema.registry import explain
 from go1exp.logs.recording import KEY, Meta, Recording, RecordingError, joint_channels, problems
@@ -76,7 +75,7 @@ def files(path: Path, *patterns: str) -> list[Path]:
     if path.is_file():
         return [path]
     if not path.exists():
-        raise RecordingError(f"{path}: no such file or folder", status=REFUSED)
+        raise RecordingError(f"{path}: no such file or folder")
     present = sorted(file for file in path.rglob("*") if file.is_file())
     for pattern in patterns:
         if matches := [file for file in present if fnmatch(file.name.lower(), pattern.lower())]:

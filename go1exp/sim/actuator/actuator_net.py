@@ -23,9 +23,9 @@ import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from go1exp.base.errors import REFUSED
+from go1exp.base.errors import Unusable
 from go1exp.base.files import opened, write_bytes
-from go1exp.config.schema.registry import STRICT, Count, Expected, NonNegative, Positive, explain
+from go1exp.config.schema.registry import STRICT, Count, NonNegative, Positive, explain
 
 if TYPE_CHECKING:
     from onnx import NodeProto, TensorProto
@@ -45,7 +45,7 @@ Name = Annotated[str, Field(min_length=1)]
 MAGIC = "go1exp actuator net"
 
 
-class NetFileError(Expected):
+class NetFileError(Unusable):
     """A file that is no actuator net, or a damaged one; the message starts with the file."""
 
 
@@ -274,7 +274,7 @@ def load(path: Path) -> ActuatorNet:
     """
     path = Path(path)
     if not path.is_file():
-        raise NetFileError(f"{path}: no such file", status=REFUSED)
+        raise NetFileError(f"{path}: no such file")
     try:
         with path.open("rb") as file:
             archive = np.load(file, allow_pickle=False)

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import mujoco
 
-from go1exp.base.errors import REFUSED
-from go1exp.config.schema.registry import Expected
+from go1exp.base.errors import Unusable
 from go1exp.robot import MOUNT
 from go1exp.sim.physics.scene import RIGID, add_mount
 
@@ -16,7 +15,7 @@ BASE = "trunk"
 """Name that the base body gets, whatever the file calls it: effects on the attitude of a held robot look for it."""
 
 
-class FixedBaseError(Expected):
+class FixedBaseError(Unusable):
     """A MuJoCo file that does not hold the robot that a configuration says."""
 
 
@@ -48,7 +47,7 @@ def build_fixed_base(
             two of them in one link.
     """
     if not file.is_file():
-        raise FixedBaseError(f"mjcf = {str(file)!r}: no such file", status=REFUSED)
+        raise FixedBaseError(f"mjcf = {str(file)!r}: no such file")
     try:
         spec = mujoco.MjSpec.from_file(str(file))
     except ValueError as error:
