@@ -115,15 +115,14 @@ def _run(verb: str, rest: list[str]) -> int:
         close = difflib.get_close_matches(verb, VERBS, n=1)
         hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(VERBS)}"
         raise errors.Expected(f"unknown verb {verb!r}; {hint}", status=errors.REFUSED)
+    from go1exp.cli.app import app_of, defer
+
+    defer("torch")  # before the modules of the verb, which import it
     if {"-h", "--help"} & {*rest}:
-        from go1exp.cli.app import defer
         from go1exp.cli.helptext import show
 
-        defer("torch")  # help computes nothing
         show(verb, rest)
         return 0
-    from go1exp.cli.app import app_of
-
     return app_of(verb).run(_by_name(verb, rest))
 
 

@@ -49,7 +49,6 @@ class App:
 
     def run(self, arguments: Sequence[str]) -> int:
         """Run with arguments; return the exit status; raise ConfigError of wrong settings, and what the task raises."""
-        defer("torch")
         warnings.filterwarnings("ignore", message="The `render_mode` attribute is not defined")
         status: list[int | None] = []
         failure: list[Exception] = []
@@ -178,12 +177,18 @@ def _without_config_dir(arguments: Sequence[str]) -> tuple[list[str], list[Path]
     return rest, folders
 
 
+class _Nothing:
+    """The class of nothing: as long as a module is not loaded, no object is of a class of it."""
+
+
 class _Deferred(ModuleType):
     """Stands for a module until something of it is used (``importlib.util.LazyLoader`` loads at the next import)."""
 
     def __getattr__(self, attribute: str) -> Any:
         if attribute == "__file__":  # inspect asks every module for it, as Hydra does to find its caller
             raise AttributeError(attribute)
+        if sys._getframe(1).f_code.co_name == "_issubclass_fast":  # scipy: is this array a torch.Tensor?
+            return _Nothing
         sys.modules.pop(self.__name__, None)
         real = importlib.import_module(self.__name__)
         self.__dict__.update(real.__dict__)

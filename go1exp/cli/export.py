@@ -56,6 +56,8 @@ def _export(container: dict[str, Any]) -> None:
     settings = parse(ExportSettings, container)
     run, out = trained(settings.run, settings.policy, "bundle.zip", settings.out)
     checkpoint = checkpoint_file(run, settings.checkpoint)
+    writable(str(out.parent))
+    show = spinner(1, "recording a trace", at_once=True)
 
     from go1exp.deploy.export.build import build
     from go1exp.deploy.runtime.bundle import loads
@@ -63,8 +65,6 @@ def _export(container: dict[str, Any]) -> None:
     from go1exp.sim.task import parse_parts
     from go1exp.train import run_folder
 
-    writable(str(out.parent))
-    show = spinner(1, "recording a trace")
     data = build(run, checkpoint, seconds=settings.seconds, seed=settings.seed, on_step=show)
     bundle = loads(data, str(out))
     write_bytes(out, data)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from go1exp.base.files import write_json
-from go1exp.cli.app import App, parse_with_groups, spinner
+from go1exp.cli.app import App, announce, parse_with_groups, spinner
 from go1exp.cli.places import read_all, remove_empty, writable
 from go1exp.cli.verbs import command
 from go1exp.config.schema import settings as schema
@@ -72,11 +72,13 @@ def _with_gains(recordings: list[Recording], gains: tuple[float, float] | None) 
 def _task(container: dict[str, Any]) -> None:
     settings, parts = parse_with_groups(FitActuatorSettings, container, ("robot",))
 
-    from go1exp.gap.actuator_net import fitting, report
-
     recordings = _with_gains(read_all(settings.recordings), settings.gains)
     existed = Path(settings.out).exists()
     out = writable(settings.out)
+    announce("fitting")
+
+    from go1exp.gap.actuator_net import fitting, report
+
     bar = spinner(settings.epochs, "fitting")
     stage = [""]
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field
 
 from go1exp.base.errors import Expected
-from go1exp.cli.app import App, parse_with_groups
+from go1exp.cli.app import App, announce, parse_with_groups
 from go1exp.cli.places import shipped_policies
 from go1exp.cli.subjects import Named, agent, word
 from go1exp.config.choices import choice_files, config_folder, load
@@ -254,13 +254,16 @@ BODY = ("robot", "actuator", "effect", "contact", "terrain")
 def _sim(container: dict[str, Any]) -> int:
     from go1exp import robot
     from go1exp.deploy.runtime.udp import parsed_address
-    from go1exp.deploy.sim_robot.machine import Body, Robot
     from go1exp.sim.effects.rules import actuator_problems
 
     settings, parts = parse_with_groups(SimSettings, container, BODY)
     if problems := actuator_problems(parts["actuator"], parts["effect"], robot.JOINTS):
         raise ConfigError(problems)
     where, page = parsed_address(settings.address, HERE), address(settings.host, settings.port)
+    announce("starting the simulated robot")
+
+    from go1exp.deploy.sim_robot.machine import Body, Robot
+
     body, config = Body(**parts, tile=settings.tile), subset(SimConfig, settings)
     if settings.viewer == "web":
         groups = {name: container[name] for name in BODY}

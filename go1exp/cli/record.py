@@ -14,7 +14,7 @@ from pydantic import Field
 from go1exp.base import errors
 from go1exp.base.files import write_json
 from go1exp.base.wording import counted, listed
-from go1exp.cli.app import App, parse, parse_with_groups, spinner
+from go1exp.cli.app import App, announce, parse, parse_with_groups, spinner
 from go1exp.cli.places import files_of, names_of, trained, writable
 from go1exp.cli.verbs import command
 from go1exp.config.compose import compose
@@ -162,10 +162,12 @@ def _record(container: dict[str, Any]) -> None:
     episodes = plan.episodes(driven, settings)  # refuses wrong settings before the folder is made
     if names & {POLICY, MPC}:
         plan.refuse_too_long(settings, "episodes", settings.episodes)
+    out = writable(settings.out)
+    announce("recording")
+
     from go1exp.logs.record import simulate
 
     rig = simulate.Rig(**{name: parts[name] for name in groups}, physics_dt=settings.physics_dt)
-    out = writable(settings.out)
     if present := sorted(p.name for p in out.glob("*.parquet")):
         held = counted(len(present), "recording")
         print(f"note: {out} holds {held} already; they stay, those of the same name are replaced")

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from go1exp.cli.app import App, parse, spinner
+from go1exp.cli.app import App, announce, parse, spinner
 from go1exp.config.schema.registry import ConfigError
 from go1exp.evaluate.report.settings import ReportSettings
 
@@ -32,9 +32,12 @@ def _task(container: dict[str, Any]) -> None:
     if settings.eval:
         _evaluate(runs, settings, protocols)
     from go1exp.evaluate.report.results import report
-    from go1exp.evaluate.report.writing import write
 
     made = report(runs, settings, dataclasses.asdict(settings))
+    announce("writing the report")
+
+    from go1exp.evaluate.report.writing import write
+
     files = write(made, folder)
     print("\n".join(lines(made)))
     print(f"written to {files[0]}; {files[1].name} and {len(files) - 2} CSV files beside it")

@@ -107,13 +107,17 @@ MOST_VALUES = 100_000
 """In a YAML file, each alias written out."""
 
 
-def content_of(text: str, loader: Any) -> Any:
-    """Return the content of a YAML text, {} of an empty one; raise YAMLError of one that OmegaConf cannot take."""
-    content = yaml.load(text, Loader=loader)
+class NotTaken(YAMLError):
+    """A YAML file that OmegaConf cannot take."""
+
+
+def content_of(file: Path, loader: Any) -> Any:
+    """Return the content of a YAML file, {} of an empty one; raise one of ``UNREADABLE``."""
+    content = yaml.load(file.read_text(encoding="utf-8"), Loader=loader)
     if content is not None and not isinstance(content, dict | list | str):
-        raise YAMLError("must be a mapping")
+        raise NotTaken("must be a mapping")
     if _written_out(content, {}) > MOST_VALUES:
-        raise YAMLError(f"an alias leads back to itself, or there are more than {MOST_VALUES:,} values")
+        raise NotTaken(f"an alias leads back to itself, or there are more than {MOST_VALUES:,} values")
     return {} if content is None else content
 
 
@@ -139,7 +143,9 @@ def why_unreadable(error: Exception) -> str:
     if isinstance(error, MarkedYAMLError):
         mark = error.problem_mark or error.context_mark
         return f"no YAML ({f'line {mark.line + 1}: ' if mark else ''}{error.problem})"
+    if isinstance(error, NotTaken):
+        return str(error)
     if isinstance(error, RecursionError):
-        return "cannot be read (nests too deeply)"
+        return "nests too deeply"
     why = error.strerror if isinstance(error, OSError) else str(error).splitlines()[0]
     return f"cannot be read ({why})"

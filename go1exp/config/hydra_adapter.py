@@ -72,8 +72,7 @@ GRAMMAR = re.compile(r"See https://hydra\.cc/docs/\S+/basic for details")
 
 def read_yaml(file: Path, resolve: bool = False) -> Any:
     """Return the content of a YAML file as plain data, ``1e3`` a number, as OmegaConf does; raise ``UNREADABLE``."""
-    content = content_of(file.read_text(encoding="utf-8"), get_yaml_loader())
-    return OmegaConf.to_container(OmegaConf.create(content), resolve=resolve)
+    return OmegaConf.to_container(OmegaConf.create(content_of(file, get_yaml_loader())), resolve=resolve)
 
 
 def to_yaml(container: Mapping[str, Any]) -> str:
@@ -118,10 +117,10 @@ def _fast_loader() -> Any:
 def _pickled(file: Path, mtime_ns: int, size: int) -> bytes:
     """Return a file's content and header, pickled, as long as the file does not change."""
     try:
-        config = OmegaConf.create(content_of(text := file.read_text(encoding="utf-8"), _fast_loader()))
+        config = OmegaConf.create(content_of(file, _fast_loader()))
     except UNREADABLE as error:
         raise ConfigError([f"{file}: {why_unreadable(error)}"]) from None
-    return pickle.dumps((config, FileConfigSource._get_header_dict(text[:512])))
+    return pickle.dumps((config, FileConfigSource._get_header_dict(file.read_text(encoding="utf-8")[:512])))
 
 
 class VerbSource(FileConfigSource):
