@@ -524,7 +524,7 @@ def test_a_recording_is_made_imported_audited_and_refused(tmp_path: Path) -> Non
     quick = ("seconds=1.0", "physics_dt=0.002", "backend.threads=1", "excitation=[gait]", "out=logs")
     done = cli(tmp_path, "record", *quick)
     assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
+    assert done.stderr == "recording ...\n"
     assert done.stdout.startswith("1 recording, 1 s, in logs\n")
     (file,) = (tmp_path / "logs").iterdir()
     done = cli(tmp_path, "record", "audit", f"logs/{file.name}", "out=audit/found.json")

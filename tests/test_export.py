@@ -450,7 +450,16 @@ def test_a_trace_is_never_unpickled(good: Bundle, members: dict[str, bytes]) -> 
         ({"odd": 1}, "odd: unknown key"),
         ({"kp": [20.0] * 11 + [-5.0]}, "kp.11 = -5: must be 0 to 1023, as the gain of RL_calf"),
         ({"kp": [1e9] + [20.0] * 11}, "kp.0 = 1e+09: must be 0 to 1023, as the gain of FR_hip"),
-        ({"torque_limit": [0.0] * 12}, "torque_limit.0 = 0: must be greater than 0, as the limit of FR_hip"),
+        (
+            {"torque_limit": [0.0] * 12},
+            "torque_limit.0 = 0: must be greater than 0 and at most 100, as the limit of FR",
+        ),
+        ({"torque_limit": [1e12] * 12}, "torque_limit.0 = 1e+12: must be greater than 0 and at most 100, as the limit"),
+        ({"velocity_limit": [1e3] * 12}, "velocity_limit.0 = 1000: must be greater than 0 and at most 100, as the"),
+        (
+            {"joint_limits": [[-1e3, 1e3]] * 12},
+            "joint_limits.0: the stops of FR_hip are more than a turn from its zero",
+        ),
         ({"joint_limits": [[1.0, -1.0]] * 12}, "joint_limits.0: the lower stop of FR_hip, 1, is not below -1"),
         ({"joints": ["FR_hip"] * 12}, "joints: FR_hip duplicate"),
         ({"command_ranges": {"lin_vel_q": [-1.0, 1.0]}}, "command_ranges.lin_vel_q: unknown axis; those of a command"),

@@ -274,6 +274,11 @@ def test_a_file_that_fails_is_one_line_with_file_line_and_error(text: str, line:
     assert refusal("my_terms.py") == expected
 
 
+def test_a_file_that_is_no_text_is_named() -> None:
+    write("my_terms.py", "\0")
+    assert refusal("my_terms.py").startswith(f"plugins: {Path('my_terms.py').resolve()}: SyntaxError: source code")
+
+
 def test_what_is_not_there_or_registers_nothing_is_refused() -> None:
     assert refusal("nowhere.py") == "plugins: nowhere.py: no such file"
     assert refusal("no_such_package") == "plugins: no_such_package: no such package is installed"

@@ -253,13 +253,14 @@ BODY = ("robot", "actuator", "effect", "contact", "terrain")
 
 def _sim(container: dict[str, Any]) -> int:
     from go1exp import robot
-    from go1exp.deploy.runtime.udp import parsed_address
+    from go1exp.deploy.runtime.udp import listening, parsed_address
     from go1exp.sim.effects.rules import actuator_problems
 
     settings, parts = parse_with_groups(SimSettings, container, BODY)
     if problems := actuator_problems(parts["actuator"], parts["effect"], robot.JOINTS):
         raise ConfigError(problems)
     where, page = parsed_address(settings.address, HERE), address(settings.host, settings.port)
+    listening(*where).close()  # refused before what takes seconds
     announce("starting the simulated robot")
 
     from go1exp.deploy.sim_robot.machine import Body, Robot

@@ -317,8 +317,8 @@ def _reason(error: BaseException, module: str, name: str, file: Path | None) -> 
         return f"{error.filename}:{error.lineno}: {type(error).__name__}: {error.msg}"
     frames = traceback.extract_tb(error.__traceback__)
     folder = str(file) if file else f"{os.sep}{module.replace('.', os.sep)}"
-    inside = [f for f in frames if folder in f.filename] or frames[-1:]
-    return f"{inside[-1].filename}:{inside[-1].lineno}: {type(error).__name__}: {text}"
+    inside = [f"{f.filename}:{f.lineno}" for f in frames if folder in f.filename] or [str(file or name)]
+    return f"{inside[-1]}: {type(error).__name__}: {text}"
 
 
 registry.MORE.append(installed)  # when a term is requested that is not registered

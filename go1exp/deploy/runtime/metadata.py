@@ -17,6 +17,10 @@ MAX_GAIN = 1023.0
 """Largest gain that the Go1's packets carry, N m/rad and N m s/rad."""
 
 
+MAX_LIMIT = 100.0
+"""Largest limit of a joint's torque, N m, and speed, rad/s: several times those of a Go1."""
+
+
 @dataclass(frozen=True)
 class Port:
     """One input or output of the graph, float32 (rows, ``size``), with its unit, frame and meaning."""
@@ -143,11 +147,12 @@ class Metadata:
                     raise ValueError(f"{name}.{k} = {value:g}: {limits}, as the gain of {self.joints[k]}")
         for name in ("torque_limit", "velocity_limit"):
             for k, value in enumerate(getattr(self, name)):
-                if value <= 0:
-                    raise ValueError(
-                        f"{name}.{k} = {value:g}: must be greater than 0, as the limit of {self.joints[k]}"
-                    )
+                if not 0 < value <= MAX_LIMIT:
+                    limits = f"must be greater than 0 and at most {MAX_LIMIT:g}"
+                    raise ValueError(f"{name}.{k} = {value:g}: {limits}, as the limit of {self.joints[k]}")
         for k, (low, high) in enumerate(self.joint_limits):
+            if max(abs(low), abs(high)) > 2 * math.pi:
+                raise ValueError(f"joint_limits.{k}: the stops of {self.joints[k]} are more than a turn from its zero")
             if low >= high:
                 raise ValueError(
                     f"joint_limits.{k}: the lower stop of {self.joints[k]}, {low:g}, is not below {high:g}"

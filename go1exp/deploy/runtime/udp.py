@@ -48,6 +48,17 @@ def parsed_address(text: str | None, default: tuple[str, int] = (ROBOT, ROBOT_PO
     return host, int(port)
 
 
+def listening(host: str, port: int) -> socket.socket:
+    """Return a socket that is bound to an address; raise RobotError if the port is taken, or the host is no own one."""
+    bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        bound.bind((host, port))
+    except OSError as error:
+        bound.close()
+        raise RobotError(f"address = {host}:{port}: {error.strerror or error}", status=REFUSED) from None
+    return bound
+
+
 @dataclass
 class Traffic:
     """Counts of the datagrams over a link.

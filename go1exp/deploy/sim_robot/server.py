@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import heapq
 import math
-import socket
 from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
@@ -16,11 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from go1exp.base.errors import REFUSED, Expected
 from go1exp.deploy.runtime import go1_wire
 from go1exp.deploy.runtime.loop import MonotonicClock, Timing, run
 from go1exp.deploy.runtime.safety import DEFAULT_KD
-from go1exp.deploy.runtime.udp import HOST, arrival, enable_timestamps
+from go1exp.deploy.runtime.udp import HOST, arrival, enable_timestamps, listening
 from go1exp.deploy.sim_robot import SimConfig
 from go1exp.deploy.sim_robot.machine import TICK, Robot
 from go1exp.robot.go1_fields import COMMAND_SIZE, JOINTS, LEGS
@@ -216,19 +214,14 @@ class Server:
         """Listen at ``port``, or at any that is free if 0; keep the newest ``kept`` s of truth and commands.
 
         Raises:
-            Expected: if the port is taken, or the host is not this machine's.
+            RobotError: if the port is taken, or the host is not this machine's.
         """
         self.robot, self.packets = robot, Packets(config)
         rng = np.random.default_rng([config.seed, 1])
         self._uplink, self._downlink = (Network(config.delay, config.loss, rng, config.jitter) for _ in range(2))
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket = listening(host, port)
         self._socket.setblocking(False)
-        try:
-            self._socket.bind((host, port))
-            enable_timestamps(self._socket)
-        except OSError as error:
-            self._socket.close()
-            raise Expected(f"address = {host}:{port}: {error.strerror or error}", status=REFUSED) from None
+        enable_timestamps(self._socket)
         self.address: tuple[str, int] = self._socket.getsockname()
         self.peer: tuple[str, int] | None = None
         self._heard = -math.inf
