@@ -327,6 +327,9 @@ def test_actions_are_cut_and_scaled_to_joint_targets_about_the_nominal_stance(st
     for wrong in (torch.zeros(12), torch.zeros(2, 12), torch.zeros(1, 1)):
         with pytest.raises(ValueError, match=r"action has shape .*; needed is \(1, 12\)"):
             core.step(wrong)
+    for other in (np.zeros((1, 12)), None):
+        with pytest.raises(ValueError, match=r"action is a (ndarray|NoneType); needed is a torch.Tensor \(1, 12\)"):
+            core.step(other)  # type: ignore[arg-type]
     core.step(torch.zeros(1, 12))
     s = core.snapshot()
     assert s.previous_action[0, :4].tolist() == [1.0, -1.0, 2.0, -2.0]

@@ -85,6 +85,17 @@ def test_rows_that_a_resumed_run_should_have_are_missed(tmp_path: Path) -> None:
         write(tmp_path, 7, 7)
 
 
+@pytest.mark.parametrize("damage", [b"\xff\xfe\x00", b"itera`ion,steps\n1,64\n2,128\n", b'"' + b"1" * 200_000, b""])
+def test_a_damaged_metrics_file_begins_anew_with_a_warning(damage: bytes, tmp_path: Path) -> None:
+    (tmp_path / "metrics.csv").write_bytes(damage)
+    (tmp_path / "timing.csv").write_text("iteration,steps\n1,64\n2,128\n")
+    with pytest.warns(UserWarning, match=r"metrics\.csv: rows of 2 of 2 iterations are missing"):
+        writer = CsvWriter(tmp_path, 2)
+    writer.write({"iteration": 3, "train/kl": 0.1}, {}, step=192)
+    assert (tmp_path / "metrics.csv").read_text().splitlines() == ["iteration,steps,train/kl", "3,192,0.1"]
+
+
+
 @pytest.mark.parametrize("resumed_after", [0, 1, 3, 5])
 def test_a_continued_file_is_byte_for_byte_that_of_one_run(resumed_after: int, tmp_path: Path) -> None:
     write(tmp_path / "whole", 1, 7)

@@ -73,6 +73,8 @@ def clipped(action: Tensor, clip: float) -> Tensor:
 
 def of_shape(action: Tensor, shape: tuple[int, ...]) -> Tensor:
     """Return ``action``; raise ValueError where it has not one row for each robot: torch would spread it out."""
+    if not isinstance(action, torch.Tensor):
+        raise ValueError(f"action is a {type(action).__name__}; needed is a torch.Tensor {tuple(shape)}")
     if tuple(action.shape) != tuple(shape):
         raise ValueError(f"action has shape {tuple(action.shape)}; needed is {tuple(shape)}, one row for each robot")
     return action

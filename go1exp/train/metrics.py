@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import math
@@ -226,9 +227,10 @@ class CsvWriter(KVWriter):
 
     def _cut(self, name: str, path: Path, iteration: int) -> int:
         """Leave the whole rows up to ``iteration``; return their number."""
-        with path.open(newline="") as file:
+        rows: list[list[str]] = []
+        with path.open(newline="", encoding="utf-8", errors="replace") as file, contextlib.suppress(csv.Error):
             rows = list(csv.reader(file))
-        if not rows:
+        if not rows or rows[0][:2] != ["iteration", "steps"]:
             return 0
         self._columns[name] = rows[0]
         whole = [r for r in rows[1:] if len(r) == len(rows[0]) and 0 < _number(r[0]) <= iteration]

@@ -226,8 +226,8 @@ class Go1Core:
         Order: physics, failure and time limit, reward, last observation, resets of ended episodes, new commands,
         pushes, first observation. A push and a new command are therefore seen before they are answered.
         """
-        if not self._deferred and action.isnan().any():  # an infinite one is clipped
-            accuse({"action": of_shape(action, self.action.shape), "qpos": self.backend.qpos}, self.steps + 1)
+        if not self._deferred and of_shape(action, self.action.shape).isnan().any():  # an infinite one is clipped
+            accuse({"action": action, "qpos": self.backend.qpos}, self.steps + 1)
         if not self.captures:
             return self.step_by_call(action)
         if self._captured is None:
