@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import shlex
 from collections.abc import Callable
@@ -256,6 +257,15 @@ def test_an_effect_file_may_be_called_anything(given: str, tmp_path: Path) -> No
     file.write_text("coulomb: {bound: 0.3}\n")
     chosen = choices_from_files([given.format(file).replace("+", "")], "train")
     assert compose("train", chosen)["effect"]["coulomb"] == {"bound": 0.3}
+
+
+def test_a_package_that_is_missing_is_named_once(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *rest: None if name == "optuna" else found(name, *rest)
+    )
+    said = "go1exp tune: needs the package optuna: pip install 'go1exp[tune]'\n"
+    assert run("tune", 'space=["ppo.gamma=interval(0.9,0.95)"]') == (2, said)
 
 
 @pytest.mark.parametrize("name", ["1", "1e5", "nan", "null", "true"])

@@ -95,7 +95,6 @@ def test_a_damaged_metrics_file_begins_anew_with_a_warning(damage: bytes, tmp_pa
     assert (tmp_path / "metrics.csv").read_text().splitlines() == ["iteration,steps,train/kl", "3,192,0.1"]
 
 
-
 @pytest.mark.parametrize("resumed_after", [0, 1, 3, 5])
 def test_a_continued_file_is_byte_for_byte_that_of_one_run(resumed_after: int, tmp_path: Path) -> None:
     write(tmp_path / "whole", 1, 7)
