@@ -254,6 +254,20 @@ def test_noise_and_clock_are_those_of_the_logger(plain: tuple[simulate.Rig, list
     np.testing.assert_allclose(even, 0.002, atol=1e-6)
 
 
+@pytest.mark.parametrize("lateness", [0.0003, 0.0008])
+def test_stamps_late_by_up_to_a_period_leave_the_clock_even(
+    lateness: float, plain: tuple[simulate.Rig, list[Recording]]
+) -> None:
+    """Of 0.8 ms some stamps come after the middle between two samples, so that rows seem lost and repeated."""
+    _, (recording, *_) = plain
+    even = even_clock(recording)
+    late = np.minimum(np.abs(lateness * np.random.default_rng(0).standard_normal(len(even))), 0.0019)
+    found = even_clock(replace(recording, channels={**recording.channels, "t": even + late}))
+    assert np.mean(late > 0.001) > (0.1 if lateness == 0.0008 else 0.0)
+    np.testing.assert_allclose(np.diff(found), 0.002, atol=2e-6)
+    np.testing.assert_allclose(found - even, late.mean(), atol=2e-4)
+
+
 # ---------------------------------------------------------------------- from end to end
 
 

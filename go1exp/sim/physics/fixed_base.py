@@ -54,12 +54,10 @@ def build_fixed_base(
         raise FixedBaseError(f"mjcf = {str(file)!r}: not a MuJoCo model ({_in_a_line(error)})") from None
     spec.compiler.fusestatic = False  # the base, which has no joint, must remain a body of its own
     _checked(spec, file, base, joints)
-    held = [joint for joint in spec.joints if joint.name not in joints]
-    names = {joint.name for joint in held}
-    ties = [tie for tie in spec.equalities if tie.type == mujoco.mjtEq.mjEQ_JOINT and names & {tie.name1, tie.name2}]
-    for part in (*ties, *held):  # a joint that is held cannot mimic another
-        spec.delete(part)
-    for part in (*spec.actuators, *spec.sensors, *spec.keys):
+    held = {joint.name: joint for joint in spec.joints if joint.name not in joints}
+    ties = [e for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT and {e.name1, e.name2} & held.keys()]
+    # A joint that is held cannot mimic another.
+    for part in (*ties, *held.values(), *spec.actuators, *spec.sensors, *spec.keys):
         spec.delete(part)
     for body in spec.bodies:
         body.simple = False  # a link whose mass an effect moves is not what MuJoCo calls simple
