@@ -266,6 +266,11 @@ def test_stamps_late_by_up_to_a_period_leave_the_clock_even(
     assert np.mean(late > 0.001) > (0.1 if lateness == 0.0008 else 0.0)
     np.testing.assert_allclose(np.diff(found), 0.002, atol=2e-6)
     np.testing.assert_allclose(found - even, late.mean(), atol=2e-4)
+    after = np.arange(len(even)) >= 900  # behind a hole of 10.4 periods
+    holed = even_clock(replace(recording, channels={**recording.channels, "t": even + late + 0.0188 * after}))
+    steps = np.diff(holed)
+    np.testing.assert_allclose(np.delete(steps, 899), 0.002, atol=3e-6)
+    assert steps[899] == pytest.approx(0.0208, abs=0.002)
 
 
 # ---------------------------------------------------------------------- from end to end

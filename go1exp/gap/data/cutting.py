@@ -63,7 +63,7 @@ def _numbered(t: np.ndarray, period: float) -> np.ndarray:
     for k in range(1, len(t)):
         steps = round((t[k] - clock) / period)
         clock += steps * period
-        clock += FOLLOWED * (t[k] - clock)
+        clock += (1.0 if steps > GAP else FOLLOWED) * (t[k] - clock)  # after a hole it begins anew
         number[k] = number[k - 1] + steps
     rows = np.arange(len(t))
     # A stamp so late that it seems to belong to the next sample belongs to the one before.
