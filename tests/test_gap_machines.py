@@ -273,6 +273,9 @@ def test_one_bad_recording_of_many_is_left_out_and_said() -> None:
     with pytest.raises(NotComparable) as refused:
         prepare([many[0], *half], xl330, GapSettings())
     assert len(refused.value.flaws) == 2
+    assert "x, y: is of the robot 'other'" in str(refused.value)
+    assert str(refused.value).count("is of the robot") == 1
+    assert refused.value.warnings == ()
 
 
 def test_hours_of_recordings_cost_no_more_than_minutes() -> None:

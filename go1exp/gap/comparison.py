@@ -10,6 +10,7 @@ from typing import get_args
 import numpy as np
 
 from go1exp.base.errors import Expected
+from go1exp.base.wording import listed
 from go1exp.gap.data.prepare import Ready, too_coarse
 from go1exp.gap.data.windows import Splits, Windows, splits, stretches
 from go1exp.gap.replay.replayer import LEVEL
@@ -111,17 +112,27 @@ def prepare(recordings: Sequence[Recording], robot: Robot, settings: GapSettings
     ]
     good = [k for k, lines in enumerate(flaws) if not lines]
     lines = tuple(line for each in flaws for line in each)
+    merged = _merged(lines)
     if not good or (lines and (len(good) < FEWEST_RECORDINGS or 2 * len(good) < len(recordings))):
-        sentence = f"These logs cannot be compared with the model: {'; '.join(lines[:3])}."
-        raise NotComparable(sentence, lines, lines)
+        sentence = f"These logs cannot be compared with the model: {'; '.join(merged[:3])}."
+        raise NotComparable(sentence, lines, merged[3:])
     kept = [reports[k] for k in good]
     copied = [f for report in kept for f in report.by_check("copy") if f.channel.startswith("tau_est_")]
     if settings.torque and copied:
         settings = replace(settings, torque=False)
         removed.append(f"tau_est: {copied[0].channel} {copied[0].message}")
     ready = robot.prepared([recordings[k] for k in good], kept, settings)
-    notes = [*(f"Left out: {line}." for line in (*removed, *lines)), *filter(None, [clock_kinds(kept)])]
+    notes = [*(f"Left out: {line}." for line in (*removed, *merged)), *filter(None, [clock_kinds(kept)])]
     return robot, replace(ready, warnings=(*notes, *ready.warnings), impossible=left_out)
+
+
+def _merged(flaws: Sequence[str]) -> list[str]:
+    """Return ``name: flaw`` lines, those of the same flaw as one line with the names of its recordings."""
+    names: dict[str, list[str]] = {}
+    for line in flaws:
+        name, _, flaw = line.partition(": ")
+        names.setdefault(flaw, []).append(name)
+    return [f"{listed(of_flaw)}: {flaw}" for flaw, of_flaw in names.items()]
 
 
 def _without_impossible_rows(
