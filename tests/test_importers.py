@@ -521,12 +521,36 @@ def test_a_topic_of_another_type_is_refused(tmp_path: Path) -> None:
     refused("mcap_joint_state", path, "/joint_states: message 0: name: required")
 
 
+def test_of_two_sources_that_move_the_commanded_one_is_taken(tmp_path: Path) -> None:
+    sent = states(10, ["a"]) + states(30, ["gripper"])
+    sent += [(i, "/command", message(i, ["a"])) for i in range(10)]
+    path = write_cdr(tmp_path / "log.mcap", sent)
+    (r,) = import_recordings("mcap_joint_state", path, {"command_topic": "/command"})
+    assert r.meta.joints == ("a",)
+    assert "30 messages of another source (gripper) left out" in r.meta.notes
+
+
+@pytest.mark.parametrize(
+    ("package", "importer", "match"),
+    [
+        ("unitree_go", "mcap_joint_state", "not unitree_go/msg/LowState; import it with unitree_lowstate_go1 or _go2"),
+        ("unitree_hg", "mcap_joint_state", "not unitree_hg/msg/LowState$"),
+        ("unitree_hg", "unitree_lowstate_go2", "not unitree_hg/msg/LowState$"),
+    ],
+)
+def test_an_importer_is_proposed_only_where_it_would_work(
+    tmp_path: Path, package: str, importer: str, match: str
+) -> None:
+    path = write_cdr(tmp_path / "log.mcap", states(5, ["a"]), kind=f"{package}/msg/LowState")
+    refused(importer, path, match, {"state_topic": "/joint_states"})
+
+
 def test_a_damaged_log_is_refused(tmp_path: Path) -> None:
     path = write_cdr(tmp_path / "log.mcap", states(50, ["a", "b"]))
     whole = path.read_bytes()
     for kept in (0, 4, 100, len(whole) // 2, len(whole) - 1):
         path.write_bytes(whole[:kept])
-        refused("mcap_joint_state", path, "not a whole MCAP file")
+        refused("mcap_joint_state", path, f"not a whole MCAP file \\({'..' if kept else 'it is empty'}")
     chunk = whole.index(b"\x28\xb5\x2f\xfd") + 20  # inside the first block of Zstandard
     path.write_bytes(whole[:chunk] + bytes([whole[chunk] ^ 255]) + whole[chunk + 1 :])
     refused("mcap_joint_state", path, "not a whole MCAP file")

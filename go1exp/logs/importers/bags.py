@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +50,7 @@ class Kind:
     types: tuple[str, ...]
     model: type[Decoded]
     joints: Callable[[Any], tuple[int, tuple[Any, ...], tuple[str, ...], Mapping[str, Sequence[float]]]]
+    others: Mapping[str, str] = field(default_factory=dict)  # other types -> how to import them, after "; "
 
 
 # ---------------------------------------------------------------------- the file
@@ -106,7 +107,7 @@ def read(path: Path, topics: Mapping[str, Kind], cut: bool) -> tuple[dict[str, l
         for messages in states.values():
             messages.sort(key=lambda state: state.log_ns)
         if not cut or not any(states.values()):
-            why = f"{path}: not a whole MCAP file ({error or type(error).__name__})"
+            why = f"{path}: not a whole MCAP file ({'it is empty' if not start else error or type(error).__name__})"
             raise RecordingError(f"{why}; {_readable(path, states)}") from error
         notes.append("The log is cut or damaged; this is its readable part.")
     for topic, messages in states.items():
@@ -172,8 +173,7 @@ def _decoder(where: str, factory: Any, schema: Any, encoding: str, wanted: Kind)
         )
     if schema is None or schema.name not in wanted.types:
         name = schema.name if schema else "without a type"
-        lowstate = "; import it with unitree_lowstate_go1 or _go2" if name.endswith("/LowState") else ""
-        raise RecordingError(f"{where}: must be {wanted.types[0]}, not {name}{lowstate}")
+        raise RecordingError(f"{where}: must be {wanted.types[0]}, not {name}{wanted.others.get(name, '')}")
     decode: Callable[[bytes], Any] | None = factory.decoder_for(encoding, schema)
     if decode is None:
         raise RecordingError(f"{where}: {encoding} with a {schema.encoding} schema; cdr with ros2msg, or json, is read")
@@ -194,13 +194,18 @@ def _checked(where: str, wanted: Kind, decode: Callable[[bytes], Any], data: byt
 # ---------------------------------------------------------------------- one source
 
 
-def joints_of(states: Sequence[State]) -> tuple[str, ...]:
-    """Return the joints of the source that moves, and of these of that with the most messages; a Go1's in our order."""
+def joints_of(states: Sequence[State], commands: Sequence[State] = ()) -> tuple[str, ...]:
+    """Return the joints of the source that is commanded, moves, and has the most messages; a Go1's in our order."""
     groups: dict[tuple[str, ...], list[State]] = {}
     for state in states:
         if state.fields["position"]:
             groups.setdefault(state.names, []).append(state)
-    names = max(groups, key=lambda key: _rank(groups[key]), default=states[0].names)
+    commanded = [set(names) for names in {state.names for state in commands}]
+
+    def rank(names: tuple[str, ...]) -> tuple[bool, bool, int]:
+        return any(set(names) <= joints for joints in commanded), *_rank(groups[names])
+
+    names = max(groups, key=rank, default=states[0].names)
     return JOINTS if set(names) == set(JOINTS) else names
 
 
@@ -219,9 +224,9 @@ def one_source(
     """
     where, groups = f"{path}: {topic}", dict[tuple[Any, ...], list[State]]()
     for i, state in enumerate(states):
-        for field, values in state.fields.items():
+        for quantity, values in state.fields.items():
             if len(values) not in (0, len(state.names)):
-                lengths = f"{len(state.names)} names, but {len(values)} of {field}"
+                lengths = f"{len(state.names)} names, but {len(values)} of {quantity}"
                 raise RecordingError(f"{where}: message {i} has {lengths}")
         filled = tuple(bool(values) for values in state.fields.values())
         zero = measured and not any(state.fields["position"])

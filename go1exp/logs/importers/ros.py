@@ -58,7 +58,9 @@ def _joints(state: _JointState) -> Joints:
     return stamp, (head.frame_id if head else "",), state.name, fields
 
 
-JOINT_STATE = bags.Kind(("sensor_msgs/msg/JointState", "sensor_msgs/JointState"), _JointState, _joints)
+LOWSTATE = {f"{package}/msg/LowState": "; import it with unitree_lowstate_go1 or _go2" for package in PACKAGES}
+
+JOINT_STATE = bags.Kind(("sensor_msgs/msg/JointState", "sensor_msgs/JointState"), _JointState, _joints, LOWSTATE)
 
 
 @importer("mcap_joint_state")
@@ -83,7 +85,8 @@ def mcap_joint_state(
     State ``position``, ``velocity``, ``effort`` become ``q``, ``qd``, ``tau_est``; command ``position`` and ``effort``
     become ``q_target`` and ``tau_cmd``, held from one command to the next; rows before the first command are left out.
     A velocity or effort that is zero or NaN throughout is taken as not measured and has no column. Messages may be CDR
-    or JSON. Of several publishers on a topic, the one that has the joints, and moves, is taken; the notes name others.
+    or JSON. Of several publishers on a topic, the one that has the joints, is commanded and moves is
+    taken; the notes name others.
 
     Args:
         path: a ``.mcap``, or a folder of them.
@@ -107,7 +110,7 @@ def mcap_joint_state(
     recordings = []
     for file in files(path, "*.mcap"):
         states, notes = bags.read(file, topics, cut)
-        names = joints or bags.joints_of(states[state_topic])
+        names = joints or bags.joints_of(states[state_topic], states.get(command_topic or "", ()))
         channels, _ = bags.channels(file, states, state_topic, command_topic, names, drop_repeats, notes)
         recordings.append(
             recording(
