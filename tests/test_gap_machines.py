@@ -399,6 +399,18 @@ def test_friction_hidden_in_a_servo_is_named() -> None:
 
 @pytest.mark.usefixtures("few")
 @pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/", "conf/model/")
+def test_strength_beside_guessed_gains_is_one_set_with_them() -> None:
+    """Also where the torque meets its limit, which a strength moves and a gain does not."""
+    narrow = {"kp_scale": {"scale": 0.3}, "kd_scale": {"scale": 0.3}}
+    robot = machine("xl330_pendulum", tolerances=narrow, firmware=None, kp=3.0, kd=0.05)
+    logs = swung(robot, {"strength": {"scale": 2.0}}, 0.8, (3.0, 5.0, 8.0), 6.0)
+    silent = [dataclasses.replace(log, meta=dataclasses.replace(log.meta, kp=None, kd=None)) for log in logs]
+    (named,) = explain(silent, robot, dataclasses.replace(QUICK, effects=("strength",))).named
+    assert set(named.alias_set) == {"strength", "kp_scale", "kd_scale"}
+
+
+@pytest.mark.usefixtures("few")
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/", "conf/model/")
 @pytest.mark.parametrize("external", [0.0, 1.0])
 def test_friction_of_loaded_gears_is_told_from_dry_friction_and_by_its_law(external: float) -> None:
     """A weight that is swung up to the level loads the gears by up to 0.5 N m, hanging down by nothing."""

@@ -128,8 +128,8 @@ def first_on_bound(search: Search, effect: str, theta: Theta, joints: Sequence[s
 def exact_aliases(search: Search, effect: str, joints: Sequence[str]) -> tuple[str, ...]:
     """Return effects whose influence on these data is that of a term, up to a factor, at all joints where it is.
 
-    By the Jacobian of what may move: columns that are parallel. Where a model guesses its gains, each effect that acts
-    as a change of the gains is compared with all others of this kind together, too.
+    By the Jacobian of what may move: columns that are parallel. Where a model guesses its gains, all effects that act
+    as a change of the gains are one set: only where a torque meets its limit do they differ together.
     """
     state, linear = search.state, search.state.table
     layout = Layout.from_probes(state.machine, linear.probes)
@@ -138,18 +138,18 @@ def exact_aliases(search: Search, effect: str, joints: Sequence[str]) -> tuple[s
     everyone = state.scorer.windows.joints
     effects = np.array([linear.probes[k].key[0] for k in layout.probe])
     at = np.isin(layout.joint, [-1, *(everyone.index(j) for j in joints)])
-    rivals = [{name} for name in dict.fromkeys(effects) if name != effect]
-    if state.machine.guessed_gains and tolerances.identification(effect).of_gains:
-        rivals.append({name for name in members("effect") if tolerances.identification(name).of_gains} - {effect})
+    of_gains = {name for name in members("effect") if tolerances.identification(name).of_gains}
+    one_set = state.machine.guessed_gains and effect in of_gains
     columns = np.flatnonzero((effects == effect) & at)
 
-    def acts_alike(names: set[str]) -> bool:
+    def acts_alike(name: str) -> bool:
         return all(
-            spanned(matrix, int(i), np.flatnonzero(np.isin(effects, list(names)) & (layout.joint == layout.joint[i])))
+            spanned(matrix, int(i), np.flatnonzero((effects == name) & (layout.joint == layout.joint[i])))
             for i in columns
         )
 
-    return tuple(sorted(set().union(*filter(acts_alike, rivals)))) if len(columns) else ()
+    alike = {name for name in effects if name != effect and acts_alike(name)} if len(columns) else set()
+    return tuple(sorted(alike | (of_gains - {effect} if one_set else set())))
 
 
 def spanned(matrix: np.ndarray, column: int, others: np.ndarray) -> bool:
