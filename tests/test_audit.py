@@ -909,43 +909,13 @@ def bench(rate: float = 200.0) -> Recording:
     return Recording(made_meta(("knee",), robot="bench", rate_hz=rate), channels)
 
 
-@pytest.mark.parametrize("channel", ["q_target_knee", "tau_est_knee"])
-def test_spikes_of_a_hundredth_of_the_rows_on_one_side_are_found_in_targets_and_torques(channel: str) -> None:
+def test_spikes_of_a_hundredth_of_the_rows_on_one_side_are_found_in_torques() -> None:
     sound = bench()
     wrong = np.random.default_rng(1).random(len(sound.t)) < 0.009
-    spiked = with_(sound, **{channel: sound.channels[channel] + 30.0 * wrong})
+    spiked = with_(sound, tau_est_knee=sound.channels["tau_est_knee"] + 30.0 * wrong)
     assert not impossible(sound).rows.any()
     assert (impossible(spiked).rows & wrong).sum() >= 0.9 * wrong.sum()
-    assert {f.channel for f in impossible(spiked).findings} == {channel}
-
-
-def test_targets_that_are_zero_for_single_rows_are_found_and_a_command_between_two_others_is_none() -> None:
-    sound = bench()
-    target = np.repeat(np.random.default_rng(2).uniform(0.2, 0.9, 40), 40)
-    wrong = np.random.default_rng(1).random(len(target)) < 0.01
-    lost = impossible(with_(sound, q_target_knee=np.where(wrong, 0.0, target)))
-    assert (lost.rows & wrong).sum() >= 0.8 * wrong.sum()
-    assert not (lost.rows & ~wrong).any()
-    short = target.copy()
-    short[400] = target[399] - 0.2  # a command that lasts for one row, before another one
-    assert not impossible(with_(sound, q_target_knee=short)).rows.any()
-
-
-def test_a_counter_that_overflows_is_called_so_and_no_sign_is_called_flipped() -> None:
-    sound = bench()
-    q = sound.channels["q_knee"]
-    angle = audit(with_(sound, q_knee=np.where(q > 0.15, q - 2 * np.pi, q)))
-    assert [f.message.count("wrap round by 6.2") for f in angle.by_check("impossible")] == [1]
-    assert not angle.by_check("sign")
-    speed = audit(with_(sound, qd_knee=(sound.channels["qd_knee"] + 3.0) % 6.0 - 3.0))
-    assert [f.channel for f in speed.by_check("impossible")] == ["qd_knee"]
-    assert "wrap round by" in speed.by_check("impossible")[0].message
-
-
-def test_one_joint_that_reads_zero_until_the_end_is_found() -> None:
-    q = bench().channels["q_knee"].copy()
-    q[-40:] = 0.0
-    np.testing.assert_array_equal(np.flatnonzero(impossible(with_(bench(), q_knee=q)).rows), np.arange(1560, 1600))
+    assert {f.channel for f in impossible(spiked).findings} == {"tau_est_knee"}
 
 
 def test_a_speed_that_an_impact_turns_within_a_row_is_no_spike_where_the_angle_shows_it() -> None:
@@ -957,12 +927,3 @@ def test_a_speed_that_an_impact_turns_within_a_row_is_no_spike_where_the_angle_s
         q[k:] += 0.6 * 0.002 / 2
         q[k + 1 :] += 0.6 * 0.002 / 2
     assert not impossible(with_(sound, q_knee=q, qd_knee=qd)).rows.any()
-
-
-@pytest.mark.parametrize(("late", "digits"), [(0, 3), (0, 2), (-3, 9), (2, 9)])
-def test_a_target_that_is_the_angle_rounded_or_rows_apart_is_a_copy(late: int, digits: int) -> None:
-    sound = bench()
-    copied = np.round(np.roll(sound.channels["q_knee"], late), digits)
-    assert [f.channel for f in copies(Log(with_(sound, q_target_knee=copied)))] == ["q_target_knee"]
-    rounded = np.round(sound.channels["q_target_knee"], digits)
-    assert not list(copies(Log(with_(sound, q_target_knee=rounded))))

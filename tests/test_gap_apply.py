@@ -380,7 +380,7 @@ def test_logs_of_another_robot_or_without_what_is_needed_are_refused() -> None:
         assert any(said in line for line in flaws), (said, flaws)
         answer = explain([recording, changed], rig.robot)
         assert (answer.verdict, answer.exit_code) == ("bad log", 14)
-        assert list(answer.warnings) == flaws
+        assert all(flaw in answer.sentence or flaw in answer.warnings for flaw in flaws)
         assert flaws[0] in answer.sentence
         assert answer.floors is None
 

@@ -273,6 +273,16 @@ def test_stamps_late_by_up_to_a_period_leave_the_clock_even(
     assert steps[899] == pytest.approx(0.0208, abs=0.002)
 
 
+@pytest.mark.parametrize("lost", [0.05, 0.15])
+def test_lost_rows_leave_the_clock_even(lost: float, plain: tuple[simulate.Rig, list[Recording]]) -> None:
+    _, (recording, *_) = plain
+    even, rng = even_clock(recording), np.random.default_rng(1)
+    kept, late = rng.random(len(even)) >= lost, np.abs(2e-4 * rng.standard_normal(len(even)))
+    channels = {name: values[kept] for name, values in recording.channels.items()}
+    found = even_clock(replace(recording, channels=channels | {"t": (even + late)[kept]}))
+    np.testing.assert_allclose(found - even[kept], late.mean(), atol=5e-5)
+
+
 # ---------------------------------------------------------------------- from end to end
 
 

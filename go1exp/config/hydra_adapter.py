@@ -290,7 +290,7 @@ def _kept(verb: str, choices: tuple[str, ...], folders: tuple[Path, ...], state:
 def _stamps(folder: str | Path) -> tuple[tuple[str, int, int], ...]:
     """Return name, time of change and size of each file below a folder."""
     stamps = []
-    for top, _, names in os.walk(folder):
+    for top, _, names in os.walk(folder, followlinks=True):
         for file in (os.path.join(top, name) for name in names):
             stat = os.stat(file)
             stamps.append((file, stat.st_mtime_ns, stat.st_size))

@@ -39,8 +39,10 @@ def even_clock(recording: Recording) -> np.ndarray:
     by speed times departure of the stamp.
     """
     t = recording.t
-    apart = max(min(50, len(t) // 4), 1)  # steps over which lateness hardly counts
-    period = float(np.median(t[apart:] - t[:-apart])) / apart
+    period = float(np.median(np.diff(t)))
+    for apart in (k for k in (10, 50) if 4 * k <= len(t)):  # steps over which lateness hardly counts, and lost rows do
+        spans = t[apart:] - t[:-apart]
+        period = float(np.median(spans / np.round(spans / period)))
     number = _numbered(t, period)
     period, offset = np.polyfit(number, t, 1)
     jitter = t - (offset + period * number)

@@ -21,7 +21,6 @@ from go1exp.logs.audit.signals import Log, finding
 from go1exp.logs.recording import Recording, problems
 
 SHORTEST = 20  # fewest rows of a recording that are checked (chosen: a median step and its spread need about as many)
-RELATIONS = ("order", "sign", "scale", "lag", "delay")  # checks that compare a channel with another
 
 
 def audit(recording: Recording) -> AuditReport:
@@ -39,11 +38,6 @@ def audit(recording: Recording) -> AuditReport:
     few = excluded.rows.mean() <= limits.MOST_IMPOSSIBLE
     log = Log(without(recording, excluded.rows) if few and excluded.findings else recording)
     findings, measured = _run_checks(log)
-    if not few:  # their rows are still in, so what relates them to others is not known
-        wrong = tuple(
-            f.channel.partition("_")[2] for f in excluded.findings if f.size and f.size > limits.MOST_IMPOSSIBLE
-        )
-        findings = [f for f in findings if f.check not in RELATIONS or not f.channel.endswith(wrong)]
     findings = [*excluded.findings, *single.clock(Log(recording)), *findings]
     off, still = _times(log, ~log.on), _times(log, log.still)
     if off:

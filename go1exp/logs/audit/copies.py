@@ -72,14 +72,12 @@ def _equal(log: Log, name: str, other: str) -> Iterator[Finding]:
         return
     a, b = (log.recording.channels[c].astype(float) for c in (name, other))
     span = float(min(np.ptp(a), np.ptp(b)))
-    steps = [log.steps[c] if c in log.steps else signals.quantum(log.recording.channels[c]) for c in (name, other)]
-    rounding = 0.51 * max(steps) if related else 0.0
+    rounding = 0.51 * max(log.steps.get(c, 0.0) for c in (name, other)) if related else 0.0
     close = min(max(rounding, 1e-6 * span), 2e-3 * span)
-    for late in sorted(range(-limits.LAW_ROWS, limits.LAW_ROWS + 1), key=abs) if related else (0,):
+    for late in (0, 1, -1) if related else (0,):
         share, count = _shared(a, np.roll(b, late), log.on, close)
         if share > limits.COPIED and count >= limits.ENOUGH * (1.0 if share < limits.DERIVED else 0.2):
-            row = "" if late == 0 else f" of {'the row' if abs(late) == 1 else f'{abs(late)} rows'} "
-            row += "" if late == 0 else "before" if late > 0 else "after"
+            row = f" of the row {'before' if late > 0 else 'after'}" if late else ""
             why = MEANING.get(kinds, "one of the two holds another quantity")
             message = f"equals {other}{row} in {share:.1%} of the rows in which they change: {why}"
             verdict = "ok" if ideal and kinds == ("tau_est", "tau_cmd") else _weight(log, kinds)

@@ -19,8 +19,6 @@ ZEROS = "are zeros between values far from zero"  # what is wrong with rows that
 
 SPIKES = "are spikes that the readings before and after rule out"
 
-WRAPS = "wrap round by {:.3g} {}, as a counter that overflows: unwrap them"
-
 Wrong = tuple[str, np.ndarray, str]
 """Channel, rows (T,) bool that cannot be right, of which there may be none, and what is wrong with them."""
 
@@ -60,19 +58,14 @@ def without(recording: Recording, rows: np.ndarray) -> Recording:
 def _wrong(recording: Recording) -> Iterator[Wrong]:
     t, joints = recording.t, recording.meta.joints
     angles = recording.joint("q") if recording.has("q") else None
-    sure = np.ones(len(t), dtype=bool)  # rows with the right angles
-    for wrong in () if angles is None else _wrong_angles(recording, angles):
-        sure &= ~wrong[1]
-        yield wrong
+    if angles is not None:
+        yield from _wrong_angles(recording, angles)
     if recording.has("qd"):
         names, speeds = joint_channels("qd", joints), recording.joint("qd")
         if angles is None:
             yield from _wrong_readings(t, names, speeds)
         else:
-            yield from _wrong_speeds(t, names, speeds, np.gradient(angles, t, axis=0), sure)
-    if recording.has("q_target"):
-        least = limits.REVERSED * float(np.median(np.diff(t)))
-        yield from _wrong_targets(joint_channels("q_target", joints), recording.joint("q_target"), least)
+            yield from _wrong_speeds(t, names, speeds, np.gradient(angles, t, axis=0))
     if recording.has("tau_est"):  # zeros are those of actuators that are off
         yield from _wrong_readings(t, joint_channels("tau_est", joints), recording.joint("tau_est"))
     for quantity in ("imu_gyro", "imu_acc"):
@@ -87,7 +80,7 @@ def _wrong_angles(recording: Recording, q: np.ndarray) -> Iterator[Wrong]:
     t, names = recording.t, joint_channels("q", recording.meta.joints)
     zeros = _zero_rows(t, q, at_ends=True)
     yield names[0] if len(names) == 1 else "q", zeros, ZEROS
-    lost = np.stack([_lone_zeros(x, ~zeros) | _zeros_at_ends(x, ~zeros) for x in q.T], axis=1)
+    lost = np.stack([_lone_zeros(x, ~zeros) for x in q.T], axis=1)
     # Spikes before jumps: one that is left by an ordinary step would part what follows from the rest.
     spikes = np.stack([_outliers(t, x, ~zeros & ~gone) for x, gone in zip(q.T, lost.T, strict=True)], axis=1)
     sound = ~zeros & ~lost.any(axis=1) & ~spikes.any(axis=1)
@@ -96,52 +89,21 @@ def _wrong_angles(recording: Recording, q: np.ndarray) -> Iterator[Wrong]:
         jumps = np.zeros(len(t), dtype=bool)
         jumps[sound] = _jumps(t[sound], q[sound, k], _fastest(recording, k))
         speed = np.abs(np.diff(q[:, k]) / np.diff(t)).max()
-        turn = _wrap(t[sound], q[sound, k], _fastest(recording, k))
-        apart = f"are apart from the others by jumps, at up to {speed:.3g} rad/s"
-        yield name, jumps, apart if turn is None else WRAPS.format(turn, "rad")
+        yield name, jumps, f"are apart from the others by jumps, at up to {speed:.3g} rad/s"
         yield name, spikes[:, k], SPIKES
 
 
-def _wrong_speeds(
-    t: np.ndarray, names: Sequence[str], qd: np.ndarray, slopes: np.ndarray, sure: np.ndarray
-) -> Iterator[Wrong]:
-    """Yield what is wrong with speeds (T, J) beside the ``slopes`` (T, J) of angles that are right in ``sure`` rows."""
+def _wrong_speeds(t: np.ndarray, names: Sequence[str], qd: np.ndarray, slopes: np.ndarray) -> Iterator[Wrong]:
+    """Yield what is wrong with speeds (T, J) beside the ``slopes`` (T, J) of the angles."""
     turns = np.any(np.abs(slopes) > limits.TURNS, axis=1)
     zeros = _zero_rows(t, qd) & turns  # a coarse encoder at rest reads zero, too
     yield names[0] if len(names) == 1 else "qd", zeros, ZEROS
-    around = np.convolve(sure, np.ones(3), "same") > 2.5
     for name, x, slope in zip(names, qd.T, slopes.T, strict=True):
-        wraps = _overflowed(x, slope) & around & ~zeros
-        yield name, wraps, WRAPS.format(np.ptp(x), "rad/s")
         # An impact turns a joint within a sample, too, but the angles show half of it.
         off = np.abs(x - slope)
         least = 0.7 * _returned(x) + limits.SURE * 1.4826 * float(np.median(off))
         spikes = (_spikes(t, x, limits.REVERSED) | _alone(t, x)) & (off > least)
-        yield name, spikes & ~zeros & ~wraps, SPIKES
-
-
-def _overflowed(x: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Return which speeds (T,) are off the ``slope`` (T,) of the angle by whole multiples of their range."""
-    whole = max(float(np.ptp(x)), 1e-9)
-    turns = np.round((x - slope) / whole)
-    off = np.abs(x - slope - turns * whole)
-    rows = turns != 0
-    exact = 10.0 * float(np.median(off)) < whole and np.mean(off[rows] < 0.1 * whole) > 0.9 if rows.any() else False
-    return rows & exact
-
-
-def _wrong_targets(names: Sequence[str], target: np.ndarray, least: float) -> Iterator[Wrong]:
-    """Yield targets (T, J) that leave by more than ``least``, rad, and are back at once, as no controller commands."""
-    for name, x in zip(names, target.T, strict=True):
-        out, steps = _returned(x), np.abs(np.diff(x))
-        back, held = np.zeros(len(x)), np.zeros(len(x), dtype=bool)
-        back[1:-1] = np.abs(x[2:] - x[:-2])
-        around = np.stack([x[3 + k : len(x) - 3 + k] for k in (-3, -2, -1, 1, 2, 3)])
-        held[3:-3] = np.ptp(around, axis=0) == 0.0
-        unusual = limits.UNUSUAL * float(np.quantile(steps[steps > 0.0], 0.95)) if steps.any() else np.inf
-        rows = (out > least) & (held | ((out > unusual) & (back < 0.1 * out)))
-        zeros = _lone_zeros(x, ~rows) & (back < 0.5 * out)
-        yield name, rows | zeros, "leave the targets before and after for a moment"
+        yield name, spikes & ~zeros, SPIKES
 
 
 def _wrong_readings(
@@ -237,17 +199,6 @@ def _lone_zeros(x: np.ndarray, sound: np.ndarray) -> np.ndarray:
     return rows
 
 
-def _zeros_at_ends(x: np.ndarray, sound: np.ndarray) -> np.ndarray:
-    """Return which ``sound`` samples (T,) are 0 up to an end, parted by a step that those beside it rule out."""
-    rows, y = np.zeros(len(x), dtype=bool), x[sound]
-    steps, least = np.abs(np.diff(y)), limits.LOST_STEPS * _step(y) if len(y) > 1 else 0.0
-    for a, b in signals.stretches(y == 0.0):
-        beside = steps[a - 5 : a] if a > 4 and b == len(y) else steps[b - 1 : b + 4][::-1] if a == 0 else steps[:0]
-        if b - a > 1 and len(beside) == 5 and beside[-1] > max(least, 3.0 * beside[:-1].max()):
-            rows[np.flatnonzero(sound)[a:b]] = True
-    return rows
-
-
 def _zero_rows(t: np.ndarray, values: np.ndarray, at_ends: bool = False) -> np.ndarray:
     """Return rows (T,) bool of ``values`` (T, J) that are exactly 0, entered and left by an unusual jump.
 
@@ -295,13 +246,3 @@ def _jumps(t: np.ndarray, x: np.ndarray, fastest: float) -> np.ndarray:
         for a, b in chain if chain is not largest else []:
             rows[a:b] = True
     return rows
-
-
-def _wrap(t: np.ndarray, x: np.ndarray, fastest: float) -> float | None:
-    """Return the range of a counter that overflows where ``x`` (T,) jumps; None if other jumps are there."""
-    whole = float(np.ptp(x)) if len(x) > 1 else 0.0
-    cuts = np.abs(np.diff(x)) > fastest * np.diff(t)
-    sizes = np.abs(np.diff(x))[cuts]
-    if not len(sizes) or sizes.min() < 0.9 * whole:
-        return None
-    return float(np.median(sizes))
