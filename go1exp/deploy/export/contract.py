@@ -209,7 +209,7 @@ def alternatives(spec: Spec) -> Iterator[tuple[str, Spec]]:
 def _variants(spec: Spec) -> Iterator[tuple[str, Spec]]:
     """Yield contracts that differ from the stated one in at most one respect, with its name."""
     change, scale = dataclasses.replace, spec.joints("action_scale")
-    per_joint = ("kp", "kd", "default_pose", "action_scale")
+    per_joint = ("kp", "kd", "default_pose", "action_scale", "joint_sign")
     by_name = {key: dict(zip(spec.names, spec.joints(key), strict=True)) for key in per_joint}
     for name in ORDERS:
         yield f"joint order: joint_order={name}", change(spec, joint_order=name, **by_name)
