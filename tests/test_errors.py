@@ -182,7 +182,8 @@ def test_ctrl_c_at_any_time_is_one_line(tmp_path: Path) -> None:
         time.sleep(1.0)
         os.killpg(bench.pid, signal.SIGINT)
         assert bench.stderr.read() == "go1exp bench: stopped\n"
-        assert bench.wait(30.0) == 130
+        # Python ends itself by the signal if it came while a library ran text as code; a shell calls both 130.
+        assert bench.wait(30.0) in (130, -signal.SIGINT)
 
 
 def test_what_ends_is_explained_where_hydra_is_not_loaded() -> None:
