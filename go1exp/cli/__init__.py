@@ -9,6 +9,7 @@ import io
 import os
 import signal
 import sys
+from collections import namedtuple
 from types import FrameType
 
 from go1exp.base import errors, signals
@@ -64,9 +65,9 @@ def main() -> int:
         stopped = received or isinstance(error, KeyboardInterrupt)
         if stopped:  # a library that is interrupted while it is loaded may raise something else
             signal.signal(signal.SIGINT, signal.SIG_DFL)  # a second Ctrl-C shall not be a traceback
-            # If it came within another exec of text, as of dataclasses, Python under -m would end by the signal, not
-            # with our status; each exec forgets that of the one before (run_eval_code_obj in CPython's pythonrun.c).
-            exec("")
+            # Where it came while Python ran text, as dataclasses do, Python under -m would end by the signal, not with
+            # our status, unless more text is run, as by namedtuple (run_eval_code_obj in CPython's pythonrun.c).
+            namedtuple("Nothing", "")
             return errors.end(KeyboardInterrupt(), title)
         if wants_traceback and not isinstance(error, BrokenPipeError):
             raise

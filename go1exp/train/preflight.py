@@ -22,7 +22,7 @@ from go1exp.train import metrics
 from go1exp.train.schedule import check_measures
 
 SLOWEST = 0.02
-"""Commands that are all slower than this, m/s, cannot be told from the sway of a gait (chosen)."""
+"""Commands that are all slower than this, m/s, do not differ from the sway of a gait (chosen)."""
 
 LEAST_ROBOTS = 64
 """On each of several GPUs: a tensor is taken for the robots' by its length, which no other has (``train/group.py``)."""

@@ -49,7 +49,7 @@ def parsed_address(text: str | None, default: tuple[str, int] = (ROBOT, ROBOT_PO
 
 
 def listening(host: str, port: int) -> socket.socket:
-    """Return a socket that is bound to an address; raise RobotError if the port is taken, or the host is no own one."""
+    """Return a socket that is bound to an address; raise RobotError if it cannot be bound."""
     bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         bound.bind((host, port))

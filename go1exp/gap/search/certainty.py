@@ -148,8 +148,8 @@ def exact_aliases(search: Search, effect: str, joints: Sequence[str]) -> tuple[s
             for i in columns
         )
 
-    alike = {name for name in effects if name != effect and acts_alike(name)} if len(columns) else set()
-    return tuple(sorted(alike | (of_gains - {effect} if one_set else set())))
+    parallel = {name for name in effects if name != effect and acts_alike(name)} if len(columns) else set()
+    return tuple(sorted(parallel | (of_gains - {effect} if one_set else set())))
 
 
 def spanned(matrix: np.ndarray, column: int, others: np.ndarray) -> bool:
