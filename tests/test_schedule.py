@@ -28,6 +28,9 @@ STEPS = 64
 WEIGHT = "set: reward.gait.weight, from: 1.0, to: 3.0"
 
 
+STIFF = "set: contact.time_constant, from: 0.02, to: 0.005"
+
+
 def ramp(text: str, key: str = "x") -> str:
     return f"+schedule.{key}={{{text}}}"
 
@@ -206,6 +209,20 @@ def test_a_ramp_may_wait_for_two_metrics_at_once() -> None:
         ramp(f"{WEIGHT}, over: 0, when: {{measure: rollout/return, above: 1, also: {{measure: rmse, below: 1}}}}")
     )
     assert said.startswith("schedule.x.when.also.measure: unknown metric 'rmse'")
+
+
+def test_a_training_says_when_its_schedule_begins_and_that_it_never_began(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    soon = "when: {measure: rollout/length, above: 0, iterations: 2}"
+    never = "when: {measure: train/std, below: 0.001, iterations: 1, also: {measure: rollout/length, above: 0}}"
+    train(tmp_path, [*FLAT, SIX, ramp(f"{WEIGHT}, over: 1, {soon}"), ramp(f"{STIFF}, over: 1, {never}", "y")])
+    said = [line for line in capsys.readouterr().err.splitlines() if "schedule" in line]
+    assert said[0] == "iteration 2: the schedule begins x"
+    for line, iteration in zip(said[1:], (3, 6), strict=True):
+        row = rows(tmp_path / "metrics.csv")[iteration - 1]
+        assert line.startswith(f"warning: iteration {iteration} of 6, and of the schedule y wait for train/std")
+        assert f"<= 0.001 (it is {float(row['train/std']):.3g}) and rollout/length >= 0.0 (it is " in line
 
 
 @pytest.mark.parametrize(

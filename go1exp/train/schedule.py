@@ -64,16 +64,20 @@ class Schedule:
         """Metrics that start a ramp."""
         return {trigger.measure for of_ramp in self._triggers.values() for trigger in of_ramp}
 
-    def advance(self, steps: int, metrics: Mapping[str, float]) -> None:
+    def advance(self, steps: int, metrics: Mapping[str, float]) -> list[str]:
         """Put the values of the next iteration into force.
 
         Args:
             steps: of all robots together so far.
             metrics: of the iteration that ended; those of ``measures`` at least, the same in each process of a group.
 
+        Returns:
+            Names of the ramps whose threshold was reached now.
+
         Raises:
             ConfigError: if a metric is missing.
         """
+        begun = []
         for key, triggers in self._triggers.items():
             if self._started[key] is not None:
                 continue
@@ -89,7 +93,19 @@ class Schedule:
                 satisfied.append(full and trigger.satisfied_by(sum(recent) / len(recent)))
             if all(satisfied):
                 self._started[key] = steps
+                begun.append(key)
         self._apply(steps)
+        return begun
+
+    def waiting(self) -> str:
+        """Return which ramps have not reached their thresholds, and how far the metrics are; empty if none waits."""
+        names: dict[str, list[str]] = {}
+        for key, triggers in self._triggers.items():
+            if self._started[key] is None:
+                means = [sum(recent) / len(recent) if recent else math.nan for recent in self._recent[key]]
+                pairs = zip(triggers, means, strict=True)
+                names.setdefault(" and ".join(f"{t} (it is {mean:.3g})" for t, mean in pairs), []).append(key)
+        return "; ".join(f"{', '.join(keys)} wait for {condition}" for condition, keys in names.items())
 
     def _apply(self, steps: int) -> None:
         """Write the values at ``steps`` into the environment, those that differ from the present ones."""

@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -97,6 +97,19 @@ class Progress:
             self._printed = elapsed
             left = (self._last - iteration) * elapsed / max(iteration - self._first, 1)
             print(f"iteration {iteration}/{self._last}  {text}  {duration(left)} left", file=sys.stderr, flush=True)
+
+    def say_ramps(self, iteration: int, begun: Sequence[str], waiting: str) -> None:
+        """Say which ramps of the schedule begin, and at half the training and at its end which still wait."""
+        if begun:
+            self._say(f"iteration {iteration}: the schedule begins {', '.join(begun)}")
+        if waiting and iteration in (self._last // 2, self._last):
+            self._say(f"warning: iteration {iteration} of {self._last}, and of the schedule {waiting}")
+
+    def _say(self, text: str) -> None:
+        if self._bar:
+            self._bar.console.print(text, markup=False, highlight=False)
+        else:
+            print(text, file=sys.stderr, flush=True)
 
 
 def duration(seconds: float) -> str:
@@ -285,8 +298,10 @@ class _Closing:
             self.progress.update(ppo.iteration, logged)
         self.logger.dump(step=ppo.num_timesteps)
         measures = {name: logged[name] for name in ppo.schedule.measures if name in logged}
-        ppo.schedule.advance(ppo.num_timesteps, ppo.group.agreed(measures) if ppo.schedule.measures else {})
+        begun = ppo.schedule.advance(ppo.num_timesteps, ppo.group.agreed(measures) if ppo.schedule.measures else {})
         last = ppo.iteration >= self.config.ppo.iterations
+        if self.progress:
+            self.progress.say_ramps(ppo.iteration, begun, ppo.schedule.waiting())
         reason = ppo.group.agreed(self.stop.reason(ppo.iteration, logged) if self.stop and not last else "")
         stopping = ppo.group.agreed(self.asked_to_stop())
         if last or stopping or reason or ppo.iteration % self.config.checkpoint.every == 0:

@@ -235,6 +235,11 @@ class Trigger(Strict):
         if (self.below is None) == (self.above is None):
             raise ValueError("measure: needs one of below and above")
 
+    def __str__(self) -> str:
+        """Return the metric and its threshold."""
+        threshold = f">= {self.above}" if self.below is None else f"<= {self.below}"
+        return f"{self.measure} {threshold}"
+
     def satisfied_by(self, mean: float) -> bool:
         """Return whether the ramp starts at this mean of the metric."""
         return mean <= self.below if self.below is not None else mean >= (self.above or 0.0)
