@@ -119,6 +119,7 @@ BOUND_PHASE = {"foot_air_time": feet(FR=0.1, FL=0.1), "foot_contact_time": feet(
 PRONK_PHASE = {"foot_air_time": [0.1] * 4, "foot_contact_time": [0.0] * 4}
 LANDING = {"foot_touchdown_speed": [1.5, 2.0, 0.5, 9.0], "foot_touchdown": [True, False, True, False]}
 QUARTER, THIRD = {"command": WALK, "episode_time": 0.1}, {"command": WALK, "episode_time": 0.3}
+TURNING = {"command": [0.0, 0.0, 0.5], "episode_time": 0.1}
 APART = {"foot_air_time": [0.0, 1.0, 2.0, 3.0], "foot_contact_time": [10.0, 20.0, 30.0, 40.0]}
 SLIDING = {
     "foot_vel_w": feet(FR=[3.0, -4.0, 9.0], FL=[0.0, 1.0, 9.0], RR=[0.5, 0.0, -9.0]),
@@ -128,6 +129,7 @@ ON_THREE = {"foot_contact_time": [1.0, 0.0, 1.0, 1.0]}
 STEPPING = {"command": WALK, "foot_air_time": feet(FR=0.1, RL=0.3), "foot_contact_time": feet(FL=0.05, RR=0.25)}
 TWO_LAND = {"foot_last_air_time": [0.3, 0.1, 0.5, 0.0], "foot_touchdown": [True, True, False, False], "command": WALK}
 METRE_OFF = {"command": [1.0, 0.0, 1.0], "base_lin_vel_b": [0.4, 0.8, 0.0]}
+FAST_WALK = {"command": [3.0, 0.0, 0.0], "base_lin_vel_b": [3.0, 0.0, 0.0]}
 TENTH_OFF = [q + 0.1 for q in robot.NOMINAL_STANCE]
 DRIFTING, SLOW = (
     {"joint_pos": TENTH_OFF, "base_lin_vel_b": [0.9, 0, 0]},
@@ -167,6 +169,9 @@ CASES = [
     Case("linear_velocity_error", "no error", {"command": WALK, "base_lin_vel_b": [0.5, 0.0, 0.7]}, 1.0),
     Case("linear_velocity_error", "an error of 0.6 and 0.8 m/s", METRE_OFF, 0.36787944),  # exp(-1)
     Case("linear_velocity_error", "another scale", METRE_OFF, 0.60653066, {"scale": 2.0}),  # exp(-1/2)
+    # 1 + 0.5 (3 - 1)
+    Case("linear_velocity_error", "a ramp pays fast commands more", FAST_WALK, 2.0, {"ramp": 0.5}),
+    Case("linear_velocity_error", "and slow ones no less", {"base_lin_vel_b": [0.0] * 3}, 1.0, {"ramp": 0.5}),
     Case("angular_velocity_error", "no error", {"command": [0, 0, 0.7], "base_ang_vel_b": [3.0, 3.0, 0.7]}, 1.0),
     # exp(-2/2)
     Case(
@@ -201,6 +206,7 @@ CASES = [
     Case("foot_clock", "another rate", QUARTER, 0.0, {"rate": 1.25, "height": 0.1}),
     # Two feet 0.06 of 0.12 m up: each half a height off.
     Case("foot_clock", "half as high", {**QUARTER, "foot_height": [0.083, 0.023, 0.023, 0.083]}, 0.0, {"height": 0.12}),
+    Case("foot_clock", "told to turn", {**TURNING, "foot_height": [0.083, 0.02, 0.023, 0.083]}, 1.0),
     Case("foot_clock", "nothing without a command", {**QUARTER, "command": [0.0] * 3}, 0.0),
     # A quarter turn: FL and RR should bear the weight.
     Case("load_clock", "standing feet", QUARTER, 0.0),
@@ -209,6 +215,7 @@ CASES = [
     Case("load_clock", "three quarters", {**QUARTER, "foot_force": [10.0, 30.0, 30.0, 10.0]}, 0.5),
     Case("load_clock", "a fall through the air", {**QUARTER, "foot_force": [0.0] * 4}, 0.0),
     Case("load_clock", "another rate", {**QUARTER, "foot_force": feet(FL=60.0)}, math.sqrt(0.5), {"rate": 1.25}),
+    Case("load_clock", "told to turn", {**TURNING, "foot_force": feet(FL=60.0, RR=70.0)}, 1.0),
     Case("load_clock", "nothing without a command", {"episode_time": 0.1, "foot_force": feet(FL=60.0)}, 0.0),
     Case("diagonal_load", "standing feet", {**QUARTER, "foot_force": [30.0] * 4}, 0.0),
     Case("diagonal_load", "one diagonal", {**QUARTER, "foot_force": feet(FL=60.0, RR=70.0)}, 1.0),
@@ -216,6 +223,7 @@ CASES = [
     Case("diagonal_load", "three quarters", {**QUARTER, "foot_force": [10.0, 30.0, 30.0, 10.0]}, 0.5),
     Case("diagonal_load", "a side, as in a pace", {**QUARTER, "foot_force": feet(FR=60.0, RR=60.0)}, 0.0),
     Case("diagonal_load", "a fall through the air", {**QUARTER, "foot_force": [0.0] * 4}, 0.0),
+    Case("diagonal_load", "told to turn", {**TURNING, "foot_force": feet(FL=60.0, RR=70.0)}, 1.0),
     Case("diagonal_load", "no command", {"command": [0.0] * 3, "foot_force": feet(FL=60.0)}, 0.0),
     Case("foot_clearance", "standing", {}, 1.0),
     # exp(-0.057^2 tanh(2) / 0.005)
