@@ -469,6 +469,30 @@ def test_an_episode_starts_in_the_nominal_stance_or_where_table_i_says(make_core
     assert factor.max() <= 1.3 + 1e-6
     assert factor.min() >= 0.888 / 1.5 - 1e-6  # calves stop at their upper limit
     assert factor[:, [0, 1, 3, 4]].min() >= 0.7 - 1e-6
+    assert_independent(qpos[:, :2], qvel)
+
+
+def assert_independent(*draws: np.ndarray) -> None:
+    """Columns (N, ...) of numbers that were drawn each by itself: no correlation is beyond four standard errors."""
+    columns = np.concatenate([each.reshape(len(each), -1) for each in draws], axis=1)
+    correlation = np.corrcoef(columns.T) - np.eye(columns.shape[1])
+    assert np.abs(correlation).max() < 4.0 / math.sqrt(len(columns))
+
+
+def test_a_robot_is_as_table_i_says_each_number_by_itself(start_core: Make) -> None:
+    backend = start_core("rand=table1", num_envs=300).backend
+    names = ("geom_friction", "body_ipos", "body_mass", "body_inertia")
+    friction, com, mass, inertia = (backend.field(name).numpy() for name in names)
+    trunk, feet = backend.ids("body", ("trunk",)), backend.ids("geom", robot.FEET)
+    moved = (com - backend.model.body_ipos)[:, trunk]
+    factor = mass[:, 1:] / backend.model.body_mass[1:]  # all but the world
+    for drawn, low, high in ((friction[:, feet, 0], 0.4, 1.1), (moved, -0.025, 0.025), (factor, 0.8, 1.3)):
+        near = 0.01 * (high - low)
+        assert low - 1e-9 <= drawn.min() < low + near
+        assert high - near < drawn.max() <= high + 1e-9
+    assert_independent(friction[:, feet, 0], moved, factor)
+    np.testing.assert_allclose(inertia[:, 1:], factor[..., None] * backend.model.body_inertia[1:])
+    np.testing.assert_array_equal(friction[:, feet, 1:], backend.model.geom_friction[None, feet, 1:].repeat(300, 0))
 
 
 @pytest.mark.parametrize("when", ["startup", "reset"])

@@ -475,6 +475,13 @@ def test_within_the_gap_no_torque_passes_and_the_joint_has_lost_its_rotor(drives
     assert not carried.any()
     rotors.follow(torch.zeros_like(torque))
     assert torch.allclose(rotors.rate, 0.002 * torque / rotor)
+    still, read = torch.zeros_like(torque), []
+    for _ in range(3):
+        rotors.transmit(gears(gap=0.05), torque, rotor)
+        rotors.follow(still)
+        read.append(rotors.motor(still, still))
+    (before, _), (_, speed), (after, _) = read
+    assert torch.allclose(speed, (after - before) / 0.004)  # at the instant of the angle, not half a step earlier
 
 
 @pytest.mark.slow("go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from functools import cache
 from typing import Any
 
@@ -22,7 +23,7 @@ from torch import Tensor
 from go1exp import robot
 from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.config.compose import compose
-from go1exp.config.schema.registry import Term, bind
+from go1exp.config.schema.registry import Term, bind, members
 from go1exp.deploy.runtime import go1_wire
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.robot.messages import LowCmd
@@ -332,6 +333,39 @@ def test_an_effect_is_another_robot_without_it(effect: str, values: Values, othe
     found = swing(stand({effect: values}), DT, 0.2)
     assert apart(found, swing(stand({}, **other), DT, 0.2)) < 1e-12
     assert apart(found, swing(stand({}), DT, 0.2)) > 0.005
+
+
+REMEMBERING: dict[str, Values] = {
+    "command_delay": {"delay": 0.009},
+    "torque_delay": {"delay": 0.005},
+    "lag": {"time": 0.006},
+    "strength_drift": {"rate": 0.2},
+    "load_friction": {"coefficient": 0.1, "external": 1.0},
+    "flexibility": {"compliance": 0.004},
+    "backlash": {"gap": 0.01},
+}
+"""Effects with a past."""
+
+
+def remembers(effect: type[Effect]) -> bool:
+    """Whether it has a state beside the values of its parameters."""
+    return len(effect.memory) > len(effect.params) or effect.state_dict is not Effect.state_dict
+
+
+def test_effects_go_on_from_a_saved_state_bit_for_bit_and_begin_anew_at_a_reset() -> None:
+    assert {name for name, entry in members("effect").items() if remembers(entry.target)} <= set(REMEMBERING)
+    plant, other = stand(REMEMBERING), stand(REMEMBERING)
+    first = swing(plant, DT, 0.1)
+    state, engine = deepcopy(plant.state_dict()), deepcopy(plant.backend.state_dict())
+    second = swing(plant, DT, 0.1)
+    swing(other, DT, 0.03)
+    other.load_state_dict(state)
+    other.backend.load_state_dict(engine)
+    assert torch.equal(swing(other, DT, 0.1), second)
+    everyone = torch.tensor([True])
+    plant.backend.reset(everyone, STANCE, torch.zeros_like(STANCE))
+    plant.reset(everyone, STANCE)
+    assert torch.equal(swing(plant, DT, 0.1), first)
 
 
 @pytest.mark.parametrize("steps", [1.0, 3.0])
