@@ -142,14 +142,16 @@ def test_each_robot_draws_its_delay_anew_for_each_episode(drives: Drives) -> Non
     assert (late.delay[again] != first[again]).all()
 
 
-def test_a_new_episode_does_not_see_the_targets_of_the_last_one(drives: Drives) -> None:
-    setup = drives(2)
+def test_a_new_episode_does_not_see_the_last_one(drives: Drives, monkeypatch: pytest.MonkeyPatch) -> None:
+    setup, told = drives(2), list[Tensor]()
     late, still = repeater(setup, 0.01, 0.01), setup.zeros()
+    monkeypatch.setattr(late.drive, "reset", told.append)
     for _ in range(10):
         late.torque(still + 1.0, still, still)
     late.reset(torch.tensor([True, False]))
     for _ in range(3):
         assert late.torque(still + 5.0, still, still)[:, 0].tolist() == [5.0, 1.0]
+    assert [mask.tolist() for mask in told] == [[True, False]]
 
 
 def test_a_drive_without_delay_is_that_drive(make_core: Callable[..., Go1Core]) -> None:
