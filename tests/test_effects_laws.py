@@ -6,6 +6,7 @@ keep still, so that it is a mass on an axle.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from copy import deepcopy
@@ -28,6 +29,7 @@ from go1exp.deploy.runtime import go1_wire
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.robot.messages import LowCmd
 from go1exp.sim.effects.base import Effect
+from go1exp.sim.effects.stack import EffectStack
 from go1exp.sim.env.plant import Plant, actuator_setup
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu
 from go1exp.sim.physics.scene import build_model
@@ -366,6 +368,31 @@ def test_effects_go_on_from_a_saved_state_bit_for_bit_and_begin_anew_at_a_reset(
     plant.backend.reset(everyone, STANCE, torch.zeros_like(STANCE))
     plant.reset(everyone, STANCE)
     assert torch.equal(swing(plant, DT, 0.1), first)
+
+
+def test_a_spread_is_even_about_what_is_given_and_stays_within_the_bounds(drives: Callable[..., ActuatorSetup]) -> None:
+    calf, n = {"calf": 0.3}, 2000
+
+    def drawn(name: str, values: Values, half: float) -> np.ndarray:
+        (key,) = values or ("scale",)
+        of_robots = EffectStack(
+            [dataclasses.replace(term("effect", name, values), slots={"spread": {key: half}})], drives(n)
+        )
+        of_robots.draw()
+        return np.asarray(getattr(of_robots.effects[name], key))
+
+    bound = drawn("coulomb", {"bound": calf}, 0.1)
+    assert not np.delete(bound, np.s_[2::3], axis=1).any()  # at the joints that are not named there is none
+    for found, low, high in (
+        (bound[:, 2::3], 0.2, 0.4),
+        (drawn("strength", {}, 0.2), 0.8, 1.2),
+        (drawn("foot_friction", {"scale": 0.7}, 0.3), 0.4, 1.0),
+    ):
+        quarters = np.quantile(found, [0.0, 0.25, 0.5, 0.75, 1.0])
+        np.testing.assert_allclose(quarters, np.linspace(low, high, 5), atol=0.05 * (high - low))
+        assert low <= found.min() < found.max() <= high
+        assert len(np.unique(found)) > 0.99 * found.size
+    assert (drawn("viscous", {"damping": 0.05}, 0.1) == 0.0).mean() == pytest.approx(0.25, abs=0.02)
 
 
 @pytest.mark.parametrize("steps", [1.0, 3.0])
