@@ -261,6 +261,13 @@ def choice(
     return chosen, alias.tolist(), aside.tolist()
 
 
+@pytest.mark.parametrize(("within", "chosen"), [(0.97, 0), (0.985, None), (1.5, None)])
+def test_where_a_tolerance_does_as_well_nothing_must_leave_its_own(within: float, chosen: int | None) -> None:
+    gain, outside = np.array([[1.0], [within]]).repeat(20, axis=1), np.array([True, False])
+    numbers, rng = np.ones((2, 2)), np.random.default_rng(0)
+    assert _choice(gain, outside, ~outside, numbers, np.zeros(2, dtype=bool), rng)[0] == chosen
+
+
 def test_a_tilt_is_simpler_than_the_twelve_offsets_that_imitate_it() -> None:
     offsets = {("encoder_offset", "offset"): np.full(12, 0.02)}
     tilt = {("base_tilt", "roll"): np.array([0.03]), ("base_tilt", "pitch"): np.array([-0.02])}

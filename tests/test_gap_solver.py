@@ -168,6 +168,22 @@ def test_max_t_sees_what_one_group_gains_and_still_says_how_often_that_is_chance
     assert np.mean(alone < 0.01) > 2.0 * np.mean(together < 0.01) > 0.0
 
 
+def test_what_does_as_well_gains_nearly_as_much_or_most_of_it_with_a_difference_that_may_be_chance() -> None:
+    chance = np.resize([3.0, -3.0], 40)
+    gain = np.ones((5, 40))
+    gain[1:] = np.array([0.985, 0.8, 0.8, 0.6])[:, None] + np.array([0.0, 0.0, 1.0, 1.0])[:, None] * chance
+    # The best; the same; worse in each window; worse in half of them; as unsure, but far less.
+    assert significance.equals(gain, 0, np.random.default_rng(0)).tolist() == [True, True, False, True, False]
+
+
+@pytest.mark.parametrize("windows", [1, 4000], ids=["of many episodes one window", "of one episode many windows"])
+def test_a_bootstrap_draws_episodes_with_replacement_and_then_their_windows(windows: int) -> None:
+    episode = np.arange(4000) // windows
+    drawn = significance.resampled(episode, np.random.default_rng(0))
+    assert len(drawn) == 4000
+    assert len(np.unique(drawn)) / 4000 == pytest.approx(1.0 - np.exp(-1.0), abs=0.02)
+
+
 def meta(episode: str, excitation: str, kd: float, repeat_of: str | None = None) -> Meta:
     about: dict[str, Any] = {"episode": episode, "excitation": excitation, "repeat_of": repeat_of}
     return made.meta(("a",), kp=(20.0,), kd=(kd,), **about)
