@@ -286,6 +286,7 @@ def test_a_tilt_is_simpler_than_the_twelve_offsets_that_imitate_it() -> None:
         ((0.523, 0.512), (8.0, 4.0), 1),  # the same: fewer joints come first
         ((0.523, 0.512), (4.0, 4.0), 0),  # as many: the better one
         ((0.523, 0.490), (8.0, 4.0), 0),  # an equal that does not mean the same
+        ((0.523, 0.490), (12.0, 1.0), 0),  # and sets none aside, however few its joints
     ],
 )
 def test_of_equals_that_mean_the_same_the_one_at_fewer_joints_comes_first(
@@ -294,6 +295,10 @@ def test_of_equals_that_mean_the_same_the_one_at_fewer_joints_comes_first(
     gain = np.array(gains)[:, None] + np.random.default_rng(0).normal(0.0, 0.2, (2, 60))
     gain += np.array(gains)[:, None] - gain.mean(axis=1, keepdims=True)
     assert choice(gain, [(count, 1.0) for count in numbers]) == (chosen, [True, True], [False, False])
+
+
+def test_of_equals_the_one_with_fewer_parameters_sets_the_others_aside() -> None:
+    assert choice(np.full((2, 20), 0.5), [(4.0, 2.0), (4.0, 1.0)]) == (1, [False, True], [True, False])
 
 
 @pytest.mark.parametrize(
