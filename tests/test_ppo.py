@@ -228,6 +228,13 @@ def test_the_divergence_of_a_minibatch_is_worked_out_once(monkeypatch: pytest.Mo
     assert len(ppo._kl) == 3 * 4
 
 
+def test_the_first_step_of_an_update_is_taken_whatever_rounding_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    ppo = slider_ppo("ppo.epochs=3", "ppo.minibatches=4", "ppo.max_kl=0.1")
+    monkeypatch.setattr(ppo, "_divergence", lambda: torch.tensor(1.0))
+    learn(ppo, 1)
+    assert ppo.logger.name_to_value["train/gradient_steps"] == 1
+
+
 def test_the_rate_of_every_gradient_step_follows_from_the_divergences(adaptive: tuple[AdaptivePPO, Watched]) -> None:
     ppo, watched = adaptive
     low, high = ppo.config.learning_rate_range
