@@ -88,12 +88,19 @@ def test_an_optional_ramp_is_left_out_of_a_task_without_its_setting() -> None:
     assert set(train_config("actuator=pd", "command=paper", *ramps).schedule) == set()
 
 
-@pytest.mark.parametrize("times", ["start: 2, over: 4, unit: iterations", "start: 0.2, over: 0.4, unit: share"])
+@pytest.mark.parametrize(
+    "times",
+    [
+        "start: 2, over: 4, unit: iterations",
+        "start: 0.2, over: 0.4, unit: share",
+        "when: {measure: gait/trot_error, below: 0.1, iterations: 1}, over: 4, unit: iterations",
+    ],
+)
 def test_a_ramp_may_count_iterations_or_shares_of_the_training(times: str) -> None:
     _, schedule = built(ramp(f"{WEIGHT}, {times}"), "ppo.iterations=10")
     values = []
     for iteration in range(8):
-        schedule.advance(iteration * STEPS, {})
+        schedule.advance(iteration * STEPS, {"gait/trot_error": 0.3 if iteration < 2 else 0.1})
         values.append(schedule.metrics()["schedule/x"])
     assert values == [1.0, 1.0, 1.0, 1.5, 2.0, 2.5, 3.0, 3.0]
 
@@ -201,10 +208,11 @@ def test_a_ramp_may_wait_for_two_metrics_at_once() -> None:
     also = "also: {measure: tracking/rmse_x, below: 0.5, iterations: 1}"
     _, schedule = built(ramp(f"{WEIGHT}, over: 0, when: {{measure: rollout/return, above: 1, iterations: 2, {also}}}"))
     seen = []
-    for steps, (value, error) in enumerate(((2, 0.4), (2, 0.6), (0, 0.4), (2, math.nan), (2, 0.4), (0, 0.9))):
+    both = ((2, 0.4), (2, 0.6), (math.nan, 0.4), (0, 0.4), (2, math.nan), (2, 0.4), (0, 0.9))
+    for steps, (value, error) in enumerate(both):
         schedule.advance(steps, {"rollout/return": value, "tracking/rmse_x": error})
         seen.append(schedule.metrics()["schedule/x"])
-    assert seen == [1.0, 1.0, 3.0, 3.0, 3.0, 3.0]  # the mean of 2 and 0 is 1
+    assert seen == [1.0, 1.0, 1.0, 3.0, 3.0, 3.0, 3.0]  # the mean of 2 and 0 is 1; what is not measured is not there
     (said,) = problems(
         ramp(f"{WEIGHT}, over: 0, when: {{measure: rollout/return, above: 1, also: {{measure: rmse, below: 1}}}}")
     )
