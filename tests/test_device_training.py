@@ -58,13 +58,14 @@ def test_advantages_and_returns_on_the_cpu_are_those_of_sb3() -> None:
 
 def test_a_rollout_holds_what_sb3s_own_loop_collects() -> None:
     """Same seed, same first rollout: observations, actions, rewards with the value beyond a time limit, episodes."""
-    mine, theirs = learner(), learner(AdaptivePPO)
+    mine, theirs = (learner(kind, "termination={tilt: {max_angle: 0.03}}") for kind in (DevicePPO, AdaptivePPO))
     for ppo in (mine, theirs):
         ppo.train = lambda: None
         torch.manual_seed(1)
         ppo.learn(48)
     data = mine.rollout_buffer.data
     assert data["starts"][1:].any()
+    assert 0.0 < mine.core.drain_metrics(6)["task/fall_share"] < 1.0  # both ends
     for name in ("observations", "actions", "rewards", "values", "log_probs", "advantages", "returns", "means"):
         wanted = getattr(theirs.rollout_buffer, name)
         np.testing.assert_allclose(data[name].numpy(), wanted, rtol=1e-5, atol=1e-5, err_msg=name)
