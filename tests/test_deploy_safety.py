@@ -45,7 +45,8 @@ JUST_RIGHT: dict[str, tuple[LowState, LowCmd, float]] = {
     "not_finite": (low_state(joint_vel=np.full(12, 20.0)), low_cmd(), 0.0),
     "attitude": (low_state(imu_quat=np.array([1.049, 0, 0, 0])), low_cmd(), 0.0),
     "tilt": (low_state(imu_quat=leaning(0.999)), low_cmd(), 0.0),
-    "joint_range": (low_state(joint_pos=at(NOMINAL, 0, 0.863 + 0.086)), low_cmd(), 0.0),
+    # The second one is beyond the SDK's range of targets, which is no stop.
+    "joint_range": (low_state(joint_pos=at(at(NOMINAL, 0, 0.863 + 0.086), 1, 4.0)), low_cmd(), 0.0),
     "torque": (low_state(joint_torque=at(np.zeros(12), 5, -1.19 * 35.55)), low_cmd(), 0.0),
     "power": (low_state(joint_torque=np.full(12, 20.0), joint_vel=np.full(12, 499 / 240)), low_cmd(), 0.0),
 }
@@ -174,7 +175,8 @@ def test_lean_is_the_angle_to_the_vertical_whatever_the_heading() -> None:
         turned = np.array(
             [yaw[0] * w - yaw[3] * z, yaw[0] * x - yaw[3] * y, yaw[0] * y + yaw[3] * x, yaw[0] * z + yaw[3] * w]
         )
-        assert tilt_angle(turned) == pytest.approx(angle, abs=1e-7)
+        for length in (0.95, 1.0, 1.05):
+            assert tilt_angle(length * turned) == pytest.approx(angle, abs=1e-7)
 
 
 # ---------------------------------------------------------------------- what is cut
@@ -413,6 +415,11 @@ def test_the_reach_of_a_target_follows_the_gains() -> None:
     kept = [safety.review(low_state(), dataclasses.replace(far, kp=f * KP), 0.0) for f in (1, 50, 1)]
     assert [k.joint_target[0] for k in kept[:2]] == [f.joint_target[0] for f in fresh]
     assert kept[2].joint_target[0] == kept[0].joint_target[0] != kept[1].joint_target[0]
+    moving, thigh = low_state(joint_vel=np.full(12, 5.0)), low_cmd(joint_target=at(NOMINAL, 1, 9.0))
+    damped = dataclasses.replace(thigh, kd=4.0 * KD)  # at the same kp
+    asked = ((safety, thigh), (safety, damped), (make_safety(), damped))
+    first, other, alone = (s.review(moving, command, 0.0).joint_target[1] for s, command in asked)
+    assert other == alone != first
 
 
 def test_the_command_source_is_asked_for_the_time_since_walking_began() -> None:
@@ -458,6 +465,26 @@ def test_whatever_goes_wrong_while_walking_the_robot_brakes_and_the_loop_ends(
     assert all(c.command.damping and (c.command.kp == 0).all() for c in made.log[last:])
     assert not any(c.command.damping for c in made.log[:last] if c.command is not None)
     assert going == [True] * (last + 5) + [False] * (30 - last - 5)  # braking goes on for a while
+
+
+def test_a_fault_while_lying_down_is_the_end_and_no_orderly_one() -> None:
+    made = controller(odd_from(22, imu_quat=leaning(1.2)), lie_down=0.2)
+    made.run_cycles(20)
+    made.it.finish(0.2)
+    made.run_cycles(30, 20)
+    assert [c.phase for c in made.log[20:]] == ["lying_down"] * 2 + ["damping"] * 28
+    assert made.safety.fault is not None
+    assert not made.it.finished
+
+
+def test_of_the_states_of_a_cycle_the_newest_by_the_robots_clock_counts() -> None:
+    def script(cycle: int) -> Sequence[LowState]:
+        first, overtaken = (low_state(0.01 * cycle, clock=0.01 * cycle - late) for late in (0.0, 0.002))
+        return [first, overtaken]
+
+    made = controller(script)
+    made.run_cycles(20)
+    assert [c.state.clock for c in made.log] == [0.01 * k for k in range(20)]
 
 
 def test_a_stop_before_the_robot_has_said_anything_ends_the_loop() -> None:

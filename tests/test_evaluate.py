@@ -175,7 +175,11 @@ def test_leaving_the_map_ends_the_counting_and_is_no_fall(task: TaskConfig, monk
         steps[0] += 1
         return torch.tensor([steps[0] == 10, False])
 
+    def fallen(terms: StepTerms, s: Snapshot) -> Tensor:  # long after it has left the map
+        return torch.tensor([steps[0] == 20, False])
+
     monkeypatch.setattr(StepTerms, "cut_short", cut_short)
+    monkeypatch.setattr(StepTerms, "terminated", fallen)
     (row,) = evaluate(task, stand, settings(seconds=1.0))["commands"]
     assert row["falls"] == 0
     assert row["mean_time_s"] == pytest.approx((9 * 0.02 + 1.0) / 2, abs=1e-4)

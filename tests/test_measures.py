@@ -249,6 +249,8 @@ def test_heave_is_vertical_in_the_world_whichever_way_the_trunk_leans() -> None:
     leaning = dataclasses.replace(trace, projected_gravity_b=gravity, base_lin_vel_b=velocity)
     assert value("heave", leaning) == pytest.approx(0.4)
     assert value("trunk_pitch", leaning) == pytest.approx(angle)
+    told_to_stand = dataclasses.replace(leaning, command=constant(trace, 0.0, 0.0, 0.0))
+    assert value("heave", told_to_stand) == pytest.approx(0.4)
     sideways = dataclasses.replace(leaning, base_lin_vel_b=constant(trace, np.cos(angle), 1.0, np.sin(angle)))
     assert value("heave", sideways) == pytest.approx(0.0, abs=1e-12)
 
@@ -281,6 +283,9 @@ def test_cost_of_transport_is_positive_work_over_weight_and_way() -> None:
     assert value("cost_of_transport", moving) == pytest.approx(28.0 / (12.0 * 9.81 * 1.0))
     measured_power = dataclasses.replace(moving, positive_power=np.full((trace.steps, 1), 56.0))
     assert value("cost_of_transport", measured_power) == pytest.approx(56.0 / (12.0 * 9.81))
+    walks = np.arange(trace.steps)[:, None] % 2 == 0  # and stands, at other power, in the other half of the time
+    half = {"command": np.where(walks[..., None], WALK, 0.0), "positive_power": np.where(walks, 56.0, 99.0)}
+    assert value("cost_of_transport", dataclasses.replace(moving, **half)) == pytest.approx(56.0 / (12.0 * 9.81))
     slow = dataclasses.replace(moving, base_lin_vel_b=constant(trace, 0.05, 0.0, 0.0))
     assert np.isnan(value("cost_of_transport", slow))
 
