@@ -174,11 +174,20 @@ def test_a_drained_log_begins_anew_with_the_same_names() -> None:
     assert all(math.isnan(v) for v in again.values())
 
 
-def test_the_environment_counts_falls_and_time_outs(start_core: Callable[..., Go1Core]) -> None:
+def test_the_environment_counts_falls_and_time_outs(
+    start_core: Callable[..., Go1Core], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the fifth step one robot leaves the map and one falls; episodes have ten steps."""
     core = start_core("sim.episode_s=0.2", "termination=none", num_envs=3)
-    for _ in range(20):
-        result = core.step(torch.zeros(3, 12))
-    assert bool(result.truncated.all())
+    steps = [0]
+
+    def only(robot: int) -> Callable[..., torch.Tensor]:
+        return lambda *about: (torch.arange(3) == robot) & (steps[0] == 5)
+
+    monkeypatch.setattr(core.terms, "cut_short", only(0))
+    monkeypatch.setattr(core.terms, "terminated", only(1))
+    for steps[0] in range(1, 21):
+        core.step(torch.zeros(3, 12))
     got = core.drain_metrics(20)
-    assert (got["task/fall_share"], got["task/timeout_share"]) == (0.0, 1.0)
+    assert (got["task/fall_share"], got["task/timeout_share"]) == pytest.approx((1 / 6, 4 / 6))
     assert got["tracking/rmse_x"] > 0.0
