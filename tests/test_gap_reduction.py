@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from go1exp.gap.replay.rows import Theta
-from go1exp.gap.result import Candidate
+from go1exp.gap.result import Candidate, GapSettings
+from go1exp.gap.score.likelihood import removed
 from go1exp.gap.score.linear import Layout
-from go1exp.gap.search import candidates, reduction, thresholds, tolerances
-from go1exp.gap.search.candidates import _choice
+from go1exp.gap.search import candidates, reduction, stepwise, thresholds, tolerances
+from go1exp.gap.search.candidates import Trial, _choice
+from go1exp.gap.search.fit import Model
 from go1exp.gap.search.screen import Motion, Screened, Variant, library, rivals
 from go1exp.gap.search.state import Search
 from go1exp.gap.search.tolerances import Freedom
@@ -72,7 +74,7 @@ def search(state: Any, *rivals: Any) -> Search:
     )
 
 
-@pytest.mark.parametrize(("difference", "name"), [(0.03, "coulomb"), (0.30, "asymmetric_friction")])
+@pytest.mark.parametrize(("difference", "name"), [(0.03, "coulomb"), (0.10, "coulomb"), (0.30, "asymmetric_friction")])
 def test_friction_that_is_equal_both_ways_is_dry_friction(
     difference: float, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -247,6 +249,116 @@ def test_pieces_are_joints_parts_legs_sides_and_all() -> None:
     assert len(sets) == 12 + 3 + 4 + 4 + 1
     assert frozenset(j for j in JOINTS if j[1] == "R") in sets  # the right side
     assert reduction.pieces(["shoulder", "elbow"]) == [frozenset([0]), frozenset([1]), frozenset([0, 1])]
+
+
+# ---------------------------------------------------------------------- held-out tests
+
+FLOOR = np.ones((40, 4))
+"""chi2 per value of a model that is right, of 40 windows and four legs."""
+
+
+def friction(chi2: np.ndarray) -> Model:
+    """Return a fitted model with viscous friction of three tolerances."""
+    key = ("viscous", "damping")
+    theta = {key: np.full(12, 3.0 * DECLARED.param(key).tolerance)}
+    return Model("viscous", theta, Freedom(DECLARED), (key,), chi2)
+
+
+def judged(
+    now: np.ndarray, after: np.ndarray, monkeypatch: pytest.MonkeyPatch, fit: float = 1.0, **settings: Any
+) -> Trial:
+    """Test friction, which changes chi2 on held-out windows, and ``fit`` times on those of the fit."""
+    monkeypatch.setattr(candidates, "scores", lambda scorer, thetas, windows, dt: after[None])
+    scorer: Any = SimpleNamespace(replayer=SimpleNamespace(machine=MACHINE), size=np.full(40, 100.0))
+    rng, windows = np.random.default_rng(0), np.arange(40)
+    return candidates.tried(scorer, GapSettings(**settings), [friction(fit * now)], now, now, windows, 1e-3, rng)
+
+
+def test_candidates_are_tested_on_windows_that_no_fit_has_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    trial, asked = judged(2.0 * FLOOR, 2.0 * FLOOR, monkeypatch), list[np.ndarray]()
+
+    def tried(
+        scorer: Any, settings: Any, fitted: Any, train: Any, now: Any, windows: np.ndarray, *others: Any
+    ) -> Trial:
+        asked.append(windows)
+        return trial
+
+    monkeypatch.setattr(stepwise, "tried", tried)
+    scorer = SimpleNamespace(windows=SimpleNamespace(joints=JOINTS))
+    about = {"settings": GapSettings(), "dt": 1e-3, "terms": (), "scorer": scorer}
+    state: Any = SimpleNamespace(splits=SimpleNamespace(train=np.arange(40), select=np.arange(40, 80)), **about)
+    begun = Search(state, np.random.default_rng(0), lambda *about: None)
+    stepwise.held_out_test(begun, [friction(FLOOR)], state, FLOOR, FLOOR)
+    assert [windows.tolist() for windows in asked] == [[*range(40, 80)]]
+
+
+def test_where_little_is_left_a_candidate_must_remove_most_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    usual = GapSettings()
+    for left, needed in ((2.0, usual.min_share), (0.5 * (usual.material + usual.adequate), thresholds.MOST_OF_SMALL)):
+        assert judged((1.0 + left) * FLOOR, FLOOR, monkeypatch).needed == needed
+
+
+def test_what_helps_one_leg_and_harms_the_others_as_much_helps_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, after = np.array([9.0, 1.0, 1.0, 1.0]) * FLOOR, np.array([6.0, 1.5, 1.5, 1.5]) * FLOOR
+    trial = judged(now, after, monkeypatch, min_share=0.1)
+    assert trial.shown.all()
+    assert trial.share > 0.1
+    assert not trial.helps.any()
+    assert trial.chosen is None
+
+
+@pytest.mark.parametrize(("fall", "significant"), [(50.0, False), (200.0, True)])
+def test_schwarz_asks_for_a_fall_of_the_logarithm_of_the_number_of_values_for_each_unknown(
+    fall: float, significant: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """12 ln(16 000) = 116."""
+    trial = judged(3.0 * FLOOR, FLOOR, monkeypatch, fit=np.exp(-fall / 16000.0), selection="bic")
+    assert trial.p.tolist() == [0.0 if significant else 1.0]
+
+
+@pytest.mark.parametrize(("after", "kept"), [(1.0, True), (1.01, True), (1.05, False)])
+def test_a_term_with_which_all_else_fits_worse_is_none(
+    after: float, kept: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refitted = SimpleNamespace(
+        state=SimpleNamespace(held_out=lambda theta: 2.0 * FLOOR), select_chi2=(1.0 + after) * FLOOR
+    )
+    monkeypatch.setattr(stepwise, "with_term", lambda search, model: refitted)
+    asked = search(Known(lambda terms: 1.0, ("viscous",), {}))
+    found, goes_on = stepwise.accept(asked, Model("viscous", {}, Freedom(DECLARED), ()))
+    assert goes_on == (found is refitted) == kept
+    assert kept or [c.status for c in found.candidates] == ["rejected"]
+
+
+def test_a_term_is_named_again_in_the_resamples_that_it_wins() -> None:
+    """In three of four episodes it gains most, in the fourth another much more."""
+    episode = np.repeat(np.arange(4), 10)
+    state: Any = SimpleNamespace(
+        scorer=SimpleNamespace(windows=SimpleNamespace(episode=episode)), machine=SimpleNamespace(groups=LEGS[:1])
+    )
+    state.splits = SimpleNamespace(train=np.arange(0, 40, 2), select=np.arange(1, 40, 2))
+    state.settings = GapSettings(bootstraps=400)
+    of_windows = np.concatenate([episode[state.splits.train], episode[state.splits.select]])
+    gain = np.array([np.ones(40), np.where(of_windows == 3, 3.5, 0.0)])
+    share = stepwise._bootstrap_share(
+        Search(state, np.random.default_rng(0), lambda *about: None), gain, np.array([True, False])
+    )
+    assert share == pytest.approx(0.75**4 + 4 * 0.25 * 0.75**3, abs=0.08)  # not more than once in a sample of four
+
+
+def test_what_falls_below_the_floor_is_not_more_than_all_of_a_gap() -> None:
+    assert [removed(2.0, after) for after in (1.0, 0.0, -0.5)] == [0.5, 1.0, 1.0]
+    assert removed(0.0, -0.5) == 0.0
+
+
+def test_an_effect_may_leave_its_tolerance_as_a_term_and_not_where_it_is_kept() -> None:
+    key = ("viscous", "damping")
+    tolerance, may = (
+        DECLARED.param(key).tolerance,
+        Freedom(DECLARED, frozenset(["viscous"]), frozenset([("viscous", 3)])),
+    )
+    assert [may.reach(key, joint) for joint in (2, 3)] == [np.inf, tolerance]
+    assert [Freedom(DECLARED, rigid=rigid).reach(key, 2) for rigid in (False, True)] == [tolerance, 0.0]
 
 
 # ---------------------------------------------------------------------- names
