@@ -578,6 +578,11 @@ def test_a_filter_that_cannot_be_believed_is_a_fault() -> None:
     assert faults[0][0] == "estimator"
     assert "left out every sample" in faults[0][1]
 
+    blinking = made()
+    for k in range(200):
+        blinking.update(make_state(0.002 * k, joint_pos=np.full(12, np.nan)) if k % 2 else make_state(0.002 * k))
+    assert faults == []
+
     runs_away = made()
     for k in range(1500):  # thrown up, for all that the accelerometer says
         flying = {"foot_force": np.zeros(4), "imu_acc": np.array([0.0, 0.0, 30.0])}
