@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from pathlib import Path
 from typing import Any
 
@@ -201,7 +202,9 @@ def test_a_checkpoint_goes_from_one_learner_to_the_other(tmp_path: Path) -> None
     first, second = learner(), learner(AdaptivePPO)
     first.learn(48)
     checkpoint.save(first, tmp_path, keep=1)
+    drawn = random.random()  # by Python's own, which no part of a training draws from
     checkpoint.restore(second, checkpoint.load_latest(tmp_path)[0])
+    assert random.random() == drawn
     second.learn(48, reset_num_timesteps=False)
     assert second.iteration == 2
     assert second.num_timesteps == 96

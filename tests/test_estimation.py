@@ -250,6 +250,10 @@ def test_without_any_foot_on_the_ground_it_falls_freely() -> None:
     states = make_filter(config).run(rows)
     np.testing.assert_allclose(states[-1, 3:6], [0, 0, -9.81 * 0.3], atol=1e-9)
     np.testing.assert_allclose(states[-1, 2] - states[0, 2], -9.81 * 0.3**2 / 2, atol=1e-9)
+    flying = make_filter(config)
+    flying.run(np.array([standing(k * 0.01, acc=np.zeros(3), foot_force=np.zeros(4)) for k in range(201)]))
+    least = 2.0 * config.initial_speed**2  # 2 s of a speed that is as unsure as at first: nothing contradicts it
+    assert (np.diag(flying.covariance[:3, 3:6]) >= 0.999 * least).all()
 
 
 def test_an_offset_of_the_accelerometer_is_learnt_while_standing() -> None:
