@@ -221,8 +221,9 @@ def test_patience_counts_from_the_best_and_goes_on_after_a_pause(tmp_path: Path)
     assert reasons[4] == "r is no better than 2 since iteration 2"
     table = "\n".join(["iteration,steps,r", *(f"{k},{k},{v}" for k, v in enumerate(values, 1)), ""])
     (tmp_path / "metrics.csv").write_text(table)
-    resumed = EarlyStop(rule, tmp_path, 4)
-    assert resumed.reason(5, {"r": 2.2}) == reasons[4]
+    for pause in range(1, 5):  # after the best one, too
+        resumed = EarlyStop(rule, tmp_path, pause)
+        assert [resumed.reason(k, {"r": values[k - 1]}) for k in range(pause + 1, 6)] == reasons[pause:5]
 
 
 def test_a_rule_on_an_evaluation_goes_on_from_the_rows_of_evals(tmp_path: Path) -> None:
