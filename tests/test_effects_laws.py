@@ -349,7 +349,7 @@ REMEMBERING: dict[str, Values] = {
 """Effects with a past."""
 
 
-def remembers(effect: type[Effect]) -> bool:
+def remembers(effect: Any) -> bool:
     """Whether it has a state beside the values of its parameters."""
     return len(effect.memory) > len(effect.params) or effect.state_dict is not Effect.state_dict
 

@@ -287,7 +287,10 @@ def test_cost_of_transport_is_positive_work_over_weight_and_way() -> None:
     measured_power = dataclasses.replace(moving, positive_power=np.full((trace.steps, 1), 56.0))
     assert value("cost_of_transport", measured_power) == pytest.approx(56.0 / (12.0 * 9.81))
     walks = np.arange(trace.steps)[:, None] % 2 == 0  # and stands, at other power, in the other half of the time
-    half = {"command": np.where(walks[..., None], WALK, 0.0), "positive_power": np.where(walks, 56.0, 99.0)}
+    half: dict[str, Any] = {
+        "command": np.where(walks[..., None], WALK, 0.0),
+        "positive_power": np.where(walks, 56.0, 99.0),
+    }
     assert value("cost_of_transport", dataclasses.replace(moving, **half)) == pytest.approx(56.0 / (12.0 * 9.81))
     slow = dataclasses.replace(moving, base_lin_vel_b=constant(trace, 0.05, 0.0, 0.0))
     assert np.isnan(value("cost_of_transport", slow))

@@ -117,6 +117,7 @@ def test_a_ramp_may_count_iterations_or_shares_of_the_training(times: str) -> No
         ("command.slow_fraction", 0.9, ("command=widening",)),
         ("command.zero_fraction", 0.9, ("command=widening",)),
         ("command.lin_vel_x", [1.0, 2.0], ("command=widening",)),
+        ("command.ang_vel_z", [1.0, 1.2], ("command=widening",)),
     ],
 )
 def test_a_setting_that_was_changed_acts_as_if_it_had_been_configured(
