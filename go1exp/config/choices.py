@@ -111,9 +111,9 @@ class NotTaken(YAMLError):
     """A YAML file that OmegaConf cannot take."""
 
 
-def content_of(file: Path, loader: Any) -> Any:
-    """Return the content of a YAML file, {} of an empty one; raise one of ``UNREADABLE``."""
-    content = yaml.load(file.read_text(encoding="utf-8"), Loader=loader)
+def content_of(text: str, loader: Any) -> Any:
+    """Return the content of a YAML file's text, {} of an empty one; raise one of ``UNREADABLE``."""
+    content = yaml.load(text, Loader=loader)
     if content is not None and not isinstance(content, dict | list | str):
         raise NotTaken("must be a mapping")
     if _written_out(content, {}) > MOST_VALUES:

@@ -72,7 +72,8 @@ GRAMMAR = re.compile(r"See https://hydra\.cc/docs/\S+/basic for details")
 
 def read_yaml(file: Path, resolve: bool = False) -> Any:
     """Return the content of a YAML file as plain data, ``1e3`` a number, as OmegaConf does; raise ``UNREADABLE``."""
-    return OmegaConf.to_container(OmegaConf.create(content_of(file, get_yaml_loader())), resolve=resolve)
+    content = content_of(file.read_text(encoding="utf-8"), get_yaml_loader())
+    return OmegaConf.to_container(OmegaConf.create(content), resolve=resolve)
 
 
 def to_yaml(container: Mapping[str, Any]) -> str:
@@ -117,10 +118,11 @@ def _fast_loader() -> Any:
 def _pickled(file: Path, mtime_ns: int, size: int) -> bytes:
     """Return a file's content and header, pickled, as long as the file does not change."""
     try:
-        config = OmegaConf.create(content_of(file, _fast_loader()))
+        text = file.read_text(encoding="utf-8")
+        config = OmegaConf.create(content_of(text, _fast_loader()))
     except UNREADABLE as error:
         raise ConfigError([f"{file}: {why_unreadable(error)}"]) from None
-    return pickle.dumps((config, FileConfigSource._get_header_dict(file.read_text(encoding="utf-8")[:512])))
+    return pickle.dumps((config, FileConfigSource._get_header_dict(text[:512])))
 
 
 class VerbSource(FileConfigSource):
