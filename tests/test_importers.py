@@ -530,6 +530,45 @@ def test_of_two_sources_that_move_the_commanded_one_is_taken(tmp_path: Path) -> 
     assert "30 messages of another source (gripper) left out" in r.meta.notes
 
 
+def swinging(robot: int, row: int) -> list[float]:
+    """Angles of two joints of one of two robots."""
+    return [0.5 * np.sin(0.01 * row + robot + 1) + 0.3 * robot, 0.3 * np.sin(0.02 * row + robot + 1) - 0.3 * robot]
+
+
+@pytest.mark.parametrize("every", [2, 3, 8])
+def test_robots_that_publish_in_turn_on_one_topic_are_refused(tmp_path: Path, every: int) -> None:
+    sent = [(i, "/joint_states", message(i, ["a", "b"], position=swinging(i % every == 0, i))) for i in range(200)]
+    refused("mcap_joint_state", write_cdr(tmp_path / "log.mcap", sent), "has several publishers of these joints: in ")
+    alone = [(i, "/joint_states", message(i, ["a", "b"], position=swinging(0, i))) for i in range(200)]
+    lost = np.random.default_rng(0).random(200) < 0.08
+    for i in np.flatnonzero(lost):  # of one publisher, in the place of its readings
+        alone[i][2]["position"] = [0.0, 0.0]
+    (r,) = import_recordings("mcap_joint_state", write_cdr(tmp_path / "log.mcap", alone), {"robot": "arm"})
+    assert len(r.t) == 200
+
+
+@pytest.mark.parametrize(("every", "kept"), [(2, "100 of 200 messages (50%)"), (3, "67 of 200 messages (34%)")])
+def test_a_speed_in_some_messages_is_said_with_its_share_and_all_angles_are_taken(
+    tmp_path: Path, every: int, kept: str
+) -> None:
+    sent = [(i, "/joint_states", message(i, ["a", "b"], position=swinging(0, i))) for i in range(200)]
+    for i in range(200):
+        if i % every:
+            sent[i][2]["velocity"] = []
+    (r,) = import_recordings("mcap_joint_state", write_cdr(tmp_path / "log.mcap", sent), {"robot": "arm"})
+    assert (len(r.t), r.has("qd")) == (200, False)
+    assert f"velocity of /joint_states is in {kept} only and is left out" in r.meta.notes
+
+
+def test_another_robot_whose_messages_have_no_speed_is_left_out(tmp_path: Path) -> None:
+    sent = [(i, "/joint_states", message(i, ["a", "b"], position=swinging(i % 2, i))) for i in range(200)]
+    for _, _, content in sent[1::2]:
+        content["velocity"] = []
+    (r,) = import_recordings("mcap_joint_state", write_cdr(tmp_path / "log.mcap", sent), {"robot": "arm"})
+    assert (len(r.t), r.has("qd")) == (100, True)
+    assert "100 messages of a second source of these joints (a, b) left out" in r.meta.notes
+
+
 @pytest.mark.parametrize(
     ("package", "importer", "match"),
     [

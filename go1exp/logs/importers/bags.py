@@ -14,14 +14,14 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from go1exp.base.wording import counted
 from go1exp.config.schema.registry import explain
+from go1exp.logs.importers.series import between, one_motion, taking_turns
 from go1exp.logs.importers.source import beginning, joint_columns, kind, without_repeats
 from go1exp.logs.recording import RecordingError
 from go1exp.robot import JOINTS
 
 EXTRA = 'pip install "go1exp[logs]"'
 
-MOSTLY = 0.9  # share of the messages that must have a field for those without it to be left out, not the field (chosen)
-HOLE = 1.5  # step, in median ones, from which a message is missing (chosen: between one step and two)
+MOSTLY = 0.98  # share of the messages that must have a field for those without it to be left out; more are bad gaps
 
 
 class Decoded(BaseModel):
@@ -242,12 +242,14 @@ def one_source(
         why = f"lacks joint {', '.join(lacking)}" if lacking else "has all of the joints in no single message"
         raise RecordingError(f"{where}: {why}; it has {present}")
     main = max(able, key=lambda key: _rank(able[key]))
-    clock = np.array([s.log_ns for s in able[main]], np.int64)
+    clock, q = _motion(able[main], joints)
     taken, left = list(able[main]), Counter[str]()
     for key, group in groups.items():
         if key == main:
             continue
-        if key in able and not _between(clock, np.array([s.log_ns for s in group], np.int64)):
+        times, other = _motion(group, joints) if key in able else (clock, q)
+        same = measured and key[1] == main[1] and one_motion(clock, q, times, other)
+        if key in able and (same or not between(clock, times)):
             taken += group
         else:
             what = "all of them zero, " if key in able and key[3] else ""
@@ -255,18 +257,24 @@ def one_source(
             left[f"{source} ({what}{', '.join(key[0])})"] += len(group)
     notes += [f"{topic}: {counted(n, 'message')} of {source} left out." for source, n in left.items()]
     order = {id(state): i for i, state in enumerate(states)}
-    return sorted(taken, key=lambda state: order[id(state)])
+    taken.sort(key=lambda state: order[id(state)])
+    clock, q = _motion(taken, joints)
+    read = q.any(axis=1) if measured else np.zeros(len(q), dtype=bool)  # lost readings are no publisher
+    share, joint, jump = taking_turns((clock[read] - clock[0]) / 1e9, q[read])
+    if share:
+        raise RecordingError(
+            f"{where}: has several publishers of these joints: in {share:.0%} of its messages angles jump and are back "
+            f"in the next one ({joints[joint]} by {jump:.3g} rad); record one, or give each a frame_id"
+        )
+    return taken
 
 
-def _between(clock: np.ndarray, times: np.ndarray) -> bool:
-    """Return whether most ``times`` (K,) lie between regular steps of a ``clock`` (N,), where none is missing."""
-    if len(clock) < 3:
-        return False
-    after = np.searchsorted(clock, times)
-    inside = (after > 0) & (after < len(clock))
-    after = np.clip(after, 1, len(clock) - 1)
-    gap = clock[after] - clock[after - 1]
-    return bool(np.mean(inside & (gap < HOLE * np.median(np.diff(clock)))) > 0.5)
+def _motion(states: Sequence[State], joints: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Return times of logging (N,), ns, and positions (N, J), zeros where there are none."""
+    orders = {names: [names.index(joint) for joint in joints] for names in {s.names for s in states}}
+    empty = [0.0] * max(map(len, orders))
+    rows = [[(s.fields["position"] or empty)[j] for j in orders[s.names]] for s in states]
+    return np.array([s.log_ns for s in states], np.int64), np.array(rows, np.float64)
 
 
 # ---------------------------------------------------------------------- columns
@@ -352,7 +360,8 @@ def _blocks(
         if filled >= MOSTLY * len(states):
             used.append(key)
         elif filled:
-            notes.append(f"{key} of {topic} is in {filled} of {len(states)} messages only and is left out.")
+            share = f"{filled} of {len(states)} messages ({filled / len(states):.0%})"
+            notes.append(f"{key} of {topic} is in {share} only and is left out; the rows of all messages are kept.")
     whole = [s for s in states if all(s.fields[key] for key in used)]
     if len(whole) < len(states):
         notes.append(
