@@ -918,6 +918,57 @@ def test_spikes_of_a_hundredth_of_the_rows_on_one_side_are_found_in_torques() ->
     assert {f.channel for f in impossible(spiked).findings} == {"tau_est_knee"}
 
 
+@pytest.mark.parametrize(("channel", "whole"), [("q_knee", 0.9), ("q_knee", 2 * np.pi), ("qd_knee", 6.0)])
+def test_a_counter_that_wraps_is_called_so_with_its_range_and_no_sign_is_called_flipped(
+    channel: str, whole: float
+) -> None:
+    zero = np.pi if whole > 6.1 else 0.0
+    x = bench().channels[channel] + zero
+    sound = with_(bench(), **{channel: x, "q_target_knee": bench().channels["q_target_knee"] + zero})
+    assert {f.check for f in audit(sound).flaws} == {"delay"}  # of 31 ms
+    wrapped = (x + whole / 2) % whole - whole / 2
+    turns = np.round((x - wrapped) / whole)
+    report = audit(with_(sound, **{channel: wrapped}))
+    assert {f.check for f in report.flaws} <= {"impossible", "delay"}
+    (found,) = report.by_check("impossible")
+    assert found.channel == channel
+    assert found.size == pytest.approx(1 - np.unique(turns, return_counts=True)[1].max() / len(x))
+    (size,) = re.findall(r"wraps, as it jumps by its full range of (\S+) rad", found.message)
+    assert float(size) == pytest.approx(whole, rel=0.02)
+
+
+def test_an_offset_and_readings_that_are_off_by_one_size_are_no_counter_that_wraps() -> None:
+    q = bench().channels["q_knee"]
+    for wrong in (np.arange(len(q)) < 500, np.isin(np.arange(len(q)), [300, 301, 302, 900, 901])):
+        found = impossible(with_(bench(), q_knee=q + 6.0 * wrong)).findings
+        assert found
+        assert not any("counter" in f.message for f in found)
+
+
+@pytest.mark.parametrize("held", [1, 10])
+def test_targets_that_leave_for_a_row_are_found_where_none_could_be_commanded(held: int) -> None:
+    sound = bench(500.0)
+    target = np.repeat(sound.channels["q_target_knee"][::held], held)
+    wrong = np.random.default_rng(1).random(len(target)) < 0.01
+    found = impossible(with_(sound, q_target_knee=target + 0.3 * wrong))
+    assert (found.rows & wrong).sum() >= 0.8 * wrong.sum()
+    assert not (found.rows & ~wrong).any()
+    assert [f.channel for f in found.findings] == ["q_target_knee"]
+    # Such commands may be given: then the actuator answers them.
+    answer = sound.channels["tau_est_knee"] + 2.0 * np.roll(wrong, 2)
+    obeyed = impossible(with_(sound, q_target_knee=target + 0.3 * wrong, tau_est_knee=answer))
+    assert not any(f.channel == "q_target_knee" for f in obeyed.findings)
+
+
+def test_targets_of_a_policy_that_step_at_every_row_are_sound() -> None:
+    sound, rng = bench(50.0), np.random.default_rng(0)
+    steps = 0.3 * rng.standard_normal(len(sound.t))
+    late = np.clip(np.repeat(steps, 10)[: len(bench(500.0).t)], -0.4, 0.4)
+    late[1999] = late[2000]  # a command that came a row early
+    assert not impossible(with_(sound, q_target_knee=steps)).rows.any()
+    assert not impossible(with_(bench(500.0), q_target_knee=late)).rows.any()
+
+
 def test_a_speed_that_an_impact_turns_within_a_row_is_no_spike_where_the_angle_shows_it() -> None:
     sound = bench(500.0)
     q = sound.channels["q_knee"] + 3e-4 * np.random.default_rng(4).standard_normal(4000)

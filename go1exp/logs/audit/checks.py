@@ -36,7 +36,7 @@ def audit(recording: Recording) -> AuditReport:
         return _report(recording, format_findings, ())
     excluded = impossible(recording)
     few = excluded.rows.mean() <= limits.MOST_IMPOSSIBLE
-    log = Log(without(recording, excluded.rows) if few and excluded.findings else recording)
+    log = Log(without(recording, excluded.rows) if few and excluded.findings else excluded.unwrapped)
     findings, measured = _run_checks(log)
     findings = [*excluded.findings, *single.clock(Log(recording)), *findings]
     off, still = _times(log, ~log.on), _times(log, log.still)

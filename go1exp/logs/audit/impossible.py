@@ -9,13 +9,19 @@ import numpy as np
 
 import go1exp.logs.audit.limits as limits
 import go1exp.logs.audit.signals as signals
+from go1exp.logs.audit.excursions import excursions
 from go1exp.logs.audit.report import Finding
 from go1exp.logs.audit.signals import finding
-from go1exp.logs.recording import VECTORS, Recording, joint_channels
+from go1exp.logs.audit.wraps import Turns, wrapped_angle, wrapped_speed
+from go1exp.logs.recording import VECTORS, Recording, joint_channel, joint_channels
 from go1exp.robot import JOINTS, VELOCITY_LIMIT
 
 SHOWN = 5  # rows that a message lists
 ZEROS = "are zeros between values far from zero"  # what is wrong with rows that a logger filled
+
+LEAVE = "leave the targets before and after for a row, and nothing answers"
+
+WRAPS = "are off by turns of a counter that wraps, as it jumps by its full range of {:.3g} {}: unwrap them"
 
 SPIKES = "are spikes that the readings before and after rule out"
 
@@ -25,16 +31,20 @@ Wrong = tuple[str, np.ndarray, str]
 
 @dataclass(frozen=True)
 class Impossible:
-    """Rows (T,) bool that cannot be right, and a finding for each kind and channel."""
+    """Rows (T,) bool that cannot be right, a finding for each kind and channel, and what unwrapping leaves."""
 
     rows: np.ndarray
     findings: tuple[Finding, ...]
+    unwrapped: Recording
 
 
 def impossible(recording: Recording) -> Impossible:
     """Find samples that no motion explains, in a recording whose clock increases and whose values are finite."""
     rows, findings = np.zeros(len(recording.t), dtype=bool), []
-    for channel, wrong, what in _wrong(recording) if len(rows) >= limits.ENOUGH else ():
+    wraps: list[Wrong] = []
+    if len(rows) >= limits.ENOUGH:
+        recording = _unwrapped(recording, wraps)
+    for channel, wrong, what in (*wraps, *_wrong(recording)) if len(rows) >= limits.ENOUGH else ():
         if wrong.any():
             rows |= wrong
             share, which = float(wrong.mean()), np.flatnonzero(wrong)
@@ -42,7 +52,7 @@ def impossible(recording: Recording) -> Impossible:
             message = f"{len(which)} of {len(rows)} rows ({share:.2%}) {what}; rows from 0: "
             message += ", ".join(map(str, which[:SHOWN])) + rest
             findings.append(finding("impossible", channel, "bad", share, "", message))
-    return Impossible(rows, tuple(findings))
+    return Impossible(rows, tuple(findings), recording)
 
 
 def without(recording: Recording, rows: np.ndarray) -> Recording:
@@ -66,6 +76,12 @@ def _wrong(recording: Recording) -> Iterator[Wrong]:
             yield from _wrong_readings(t, names, speeds)
         else:
             yield from _wrong_speeds(t, names, speeds, np.gradient(angles, t, axis=0))
+    if recording.has("q_target"):
+        read = [joint_channels(name, joints) for name in ("q", "qd", "tau_est") if recording.has(name)]
+        for k, name in enumerate(joint_channels("q_target", joints)):
+            answers = [recording.channels[names[k]] for names in read]
+            target = recording.channels[name]
+            yield name, excursions(t, target, _returned(target), answers), LEAVE
     if recording.has("tau_est"):  # zeros are those of actuators that are off
         yield from _wrong_readings(t, joint_channels("tau_est", joints), recording.joint("tau_est"))
     for quantity in ("imu_gyro", "imu_acc"):
@@ -74,6 +90,29 @@ def _wrong(recording: Recording) -> Iterator[Wrong]:
             zeros = _zero_rows(t, values)
             yield quantity, zeros, ZEROS
             yield from _wrong_readings(t, VECTORS[quantity], values, ~zeros)
+
+
+def _unwrapped(recording: Recording, wraps: list[Wrong]) -> Recording:
+    """Return a recording whose angles and speeds do not wrap, and append which rows did."""
+    t, joints = recording.t, recording.meta.joints
+    if not recording.has("q"):
+        return recording
+
+    def add(name: str, found: Turns | None, unit: str) -> np.ndarray:
+        if found is not None:
+            wraps.append((name, found[0] != 0.0, WRAPS.format(found[1], unit)))
+            y = recording.channels[name] + found[0] * found[1]
+            target = recording.channels.get(name.replace("q_", "q_target_", 1), y)  # says which turn is none
+            changed[name] = y + found[1] * np.round(np.median(target - y) / found[1])
+        return changed.get(name, recording.channels[name])
+
+    changed: dict[str, np.ndarray] = {}
+    for k, joint in enumerate(joints):
+        name, speed = joint_channel("q", joint), joint_channel("qd", joint)
+        q = add(name, wrapped_angle(t, recording.channels[name], _fastest(recording, k)), "rad")
+        if speed in recording.channels:
+            add(speed, wrapped_speed(recording.channels[speed], np.gradient(q, t)), "rad/s")
+    return Recording(recording.meta, recording.channels | changed) if changed else recording
 
 
 def _wrong_angles(recording: Recording, q: np.ndarray) -> Iterator[Wrong]:

@@ -142,6 +142,17 @@ LOST_ROWS, LOST_STEPS = 3, 20.0
 """Longest run of zeros in one channel that is a few lost readings, and resolutions by which both neighbours are off."""
 SPANS = 5.0
 """Spans of 99 % of a channel by which a torque or a reading of the IMU must lie outside; impacts are spikes, too."""
+WRAPPED, MOVES = 0.9, 10.0
+"""Share of all that an angle reads that each jump of a counter must span, and least motion in largest other steps."""
+HALF_RANGE, EXACT, SAME_RANGE = 0.25, 0.9, 0.15
+"""Share of a counter's range by which speeds may be off whole turns of it; share of the rows that must follow a rule of
+counters; and relative departure of what is read from that range."""
+LEFT = (3, 0.1)  # fewest targets that leave those beside them for a row, and largest share: more are an excitation
+LEFT_STEPS, LEFT_REST = 5.0, 0.2
+"""Times the 95 % quantile of a target's steps by which it must leave, and share of that by which it may else move."""
+LEFT_RANGE = (1.0, 2.0)  # rad, and spans of 96 % of the targets, by which one lies far outside
+SHORT_STEP, HELD_ROWS = 6e-3, 4  # s; no command is held for a row of less where others are held for so many rows
+OBEYED = 5.0  # standard errors by which torque, speed or angle answer targets that were commanded
 MOST_IMPOSSIBLE = 0.2  # share of impossible rows above which a recording is refused and not only those rows
 
 # ---------------------------------------------------------------------- motion in the episode
