@@ -111,7 +111,7 @@ class NotTaken(YAMLError):
     """A YAML file that OmegaConf cannot take."""
 
 
-def content_of(text: str, loader: Any) -> Any:
+def loaded(text: str, loader: Any) -> Any:
     """Return the content of a YAML file's text, {} of an empty one; raise one of ``UNREADABLE``."""
     content = yaml.load(text, Loader=loader)
     if content is not None and not isinstance(content, dict | list | str):

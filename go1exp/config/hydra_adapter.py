@@ -46,10 +46,10 @@ from go1exp.config.choices import (
     FOLDERS,
     UNREADABLE,
     config_folder,
-    content_of,
     folder_of,
     groups_of,
     hidden_from,
+    loaded,
     why_unreadable,
 )
 from go1exp.config.schema.registry import ConfigError
@@ -72,8 +72,7 @@ GRAMMAR = re.compile(r"See https://hydra\.cc/docs/\S+/basic for details")
 
 def read_yaml(file: Path, resolve: bool = False) -> Any:
     """Return the content of a YAML file as plain data, ``1e3`` a number, as OmegaConf does; raise ``UNREADABLE``."""
-    content = content_of(file.read_text(encoding="utf-8"), get_yaml_loader())
-    return OmegaConf.to_container(OmegaConf.create(content), resolve=resolve)
+    return OmegaConf.to_container(OmegaConf.create(loaded(file.read_text("utf-8"), get_yaml_loader())), resolve=resolve)
 
 
 def to_yaml(container: Mapping[str, Any]) -> str:
@@ -118,8 +117,7 @@ def _fast_loader() -> Any:
 def _pickled(file: Path, mtime_ns: int, size: int) -> bytes:
     """Return a file's content and header, pickled, as long as the file does not change."""
     try:
-        text = file.read_text(encoding="utf-8")
-        config = OmegaConf.create(content_of(text, _fast_loader()))
+        config = OmegaConf.create(loaded(text := file.read_text("utf-8"), _fast_loader()))
     except UNREADABLE as error:
         raise ConfigError([f"{file}: {why_unreadable(error)}"]) from None
     return pickle.dumps((config, FileConfigSource._get_header_dict(text[:512])))
