@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -535,6 +536,33 @@ def test_a_mesh_that_is_missing_is_named_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(FixedBaseError, match=r"^mjcf = .*arm\.urdf.*link\.stl") as caught:
         build_fixed_base(tmp_path / "arm.urdf", "base_link", ["arm"], [2.0], 0.001)
     assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_body_without_mass_is_named_as_in_the_file(tmp_path: Path) -> None:
+    text = URDF.format(visual="").replace(LINK, "", 1)
+    (tmp_path / "arm.urdf").write_text(text)
+    model = partial(build_fixed_base, tmp_path / "arm.urdf", "base_link", ["arm"], [2.0], 0.001)
+    assert model().nv == 1
+    with pytest.raises(FixedBaseError, match=r"body 'base_link' can move in its mount: its mass and inertia must be"):
+        model(mounted=True)
+    (tmp_path / "arm.urdf").write_text(text.replace(LINK, ""))
+    with pytest.raises(FixedBaseError, match=r"body 'arm_link' is moved by joint 'arm': its mass and inertia must be"):
+        model()
+
+
+def test_names_and_references_of_a_file_are_its_own(tmp_path: Path) -> None:
+    inertial = '<inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>'
+    text = f"""<mujoco><worldbody><light mode="targetbody" target="stand"/><body name="stand">{inertial}<body name="b">
+      <joint name="a"/>{inertial}<body name="a"><joint name="b"/>{inertial}<body name="trunk">{inertial}</body></body>
+      </body></body></worldbody><contact><exclude body1="stand" body2="b"/></contact>
+      <equality><connect body1="a" body2="stand" anchor="0 0 0"/></equality></mujoco>"""
+    (tmp_path / "arm.xml").write_text(text)
+    model = build_fixed_base(tmp_path / "arm.xml", "stand", ["a", "b"], [2.0, 2.0], 0.001)
+    assert [model.body(k).name for k in range(4)] == ["world", "trunk", "a", "b"]
+    assert [model.body(int(side[0])).name for side in (model.eq_obj1id, model.eq_obj2id)] == ["b", "trunk"]
+    (tmp_path / "arm.xml").write_text(text.replace('joint name="b"', 'joint name="trunk"'))
+    with pytest.raises(FixedBaseError, match="joints: 'trunk' is a name of the base"):
+        build_fixed_base(tmp_path / "arm.xml", "stand", ["a", "trunk"], [2.0, 2.0], 0.001)
 
 
 def test_a_link_whose_mass_lies_on_its_joint_takes_another_mass(tmp_path: Path) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import mujoco
@@ -57,17 +58,18 @@ def build_fixed_base(
     held = {joint.name: joint for joint in spec.joints if joint.name not in joints}
     ties = [e for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT and {e.name1, e.name2} & held.keys()]
     # A joint that is held cannot mimic another.
-    for part in (*ties, *held.values(), *spec.actuators, *spec.sensors, *spec.keys):
+    seen = (*spec.excludes, *spec.pairs, *spec.cameras, *spec.lights, *spec.skins, *spec.flexes)
+    for part in (*ties, *held.values(), *spec.actuators, *spec.sensors, *spec.keys, *seen):
         spec.delete(part)
     for body in spec.bodies:
         body.simple = False  # a link whose mass an effect moves is not what MuJoCo calls simple
-    trunk = spec.body(base)
-    trunk.quat, trunk.name = list(base_quat), BASE
+    given = _rename(spec, base, joints)
+    trunk = spec.body(BASE)
+    trunk.quat = list(base_quat)
     if mounted:
         add_mount(trunk)
     for name, limit in zip(joints, effort, strict=True):
         joint = spec.joint(name)
-        joint.parent.name = name
         # Dry friction is as rigid as a step allows (see sim/physics/scene.py).
         joint.solref_friction, joint.solimp_friction = [2.0 * physics_dt, 1.0], list(RIGID)
         motor = spec.add_actuator()
@@ -81,11 +83,43 @@ def build_fixed_base(
     try:
         model = spec.compile()
     except ValueError as error:
-        raise FixedBaseError(f"mjcf = {str(file)!r}: does not compile ({_in_a_line(error)})") from None
+        raise FixedBaseError(f"mjcf = {str(file)!r}: {_cause(error, given)}") from None
     order = [model.joint(k).name for k in range(len(MOUNT) if mounted else 0, model.njnt)]
     if order != list(joints):
         raise FixedBaseError(f"joints: must be in the order of {str(file)!r}: {', '.join(order)}")
     return model
+
+
+def _rename(spec: mujoco.MjSpec, base: str, joints: Sequence[str]) -> dict[str, str]:
+    """Name the base ``BASE`` and each link as its joint, whatever others are called; return new name -> the file's."""
+    renamed = [spec.body(base), *[spec.joint(name).parent for name in joints]]
+    given = {}
+    for k, body in enumerate(spec.bodies[1:], start=1):
+        given[f"body {k}"], body.name = body.name or "without a name", f"body {k}"
+    for body, name in zip(renamed, (BASE, *joints), strict=True):
+        given[name], body.name = given.pop(body.name), name
+    new = {old: name for name, old in given.items()}
+    for tie in spec.equalities:
+        if tie.objtype == mujoco.mjtObj.mjOBJ_BODY:
+            tie.name1, tie.name2 = new.get(tie.name1, tie.name1), new.get(tie.name2, tie.name2)
+    return given
+
+
+def _cause(error: ValueError, given: Mapping[str, str]) -> str:
+    """Return what MuJoCo's compiler refuses, with the file's names of bodies.
+
+    Args:
+        error: the compiler's.
+        given: name of a body in the compiled model -> that in the file.
+    """
+    text = _in_a_line(error)
+    body = re.search(r"inertia.* Element name '([^']*)'", text)
+    if body is None:
+        return f"does not compile ({text})"
+    name, how = body[1], "can move in its mount" if body[1] == BASE else f"is moved by joint {body[1]!r}"
+    if "mass and inertia" in text:
+        return f"body {given[name]!r} {how}: its mass and inertia must be above zero"
+    return f"does not compile ({text.replace(repr(name), repr(given[name]))})"
 
 
 def _in_a_line(error: ValueError) -> str:
@@ -99,6 +133,8 @@ def _checked(spec: mujoco.MjSpec, file: Path, base: str, joints: Sequence[str]) 
     if base not in bodies[1:]:
         known = ", ".join(name for name in bodies[1:] if name)
         raise FixedBaseError(f"base = {base!r}: no body of {str(file)!r}; it has {known or 'none with a name'}")
+    if taken := {BASE, *MOUNT} & set(joints):
+        raise FixedBaseError(f"joints: {min(taken)!r} is a name of the base in the compiled model; rename that joint")
     for joint in spec.joints:
         if joint.type == mujoco.mjtJoint.mjJNT_HINGE:
             hinges[joint.name] = joint.parent.name or str(joint.parent.id)
