@@ -17,6 +17,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 import go1exp
+from go1exp.base import memory
 from go1exp.base.paths import data_root
 from go1exp.config.schema.registry import ConfigError
 from go1exp.sim.env import register
@@ -274,6 +275,17 @@ def test_an_argument_of_make_that_cannot_be_is_named(arguments: dict[str, Any], 
     assert str(refused.value) == message
 
 
+@pytest.mark.parametrize("number", [10**7, 10**12, 10**400])
+def test_robots_that_do_not_fit_into_memory_are_refused_at_once(
+    number: int, registered: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(memory, "free", lambda: 6 * 10**9)
+    words = rf"^num_envs = {number}: with {number} robots it takes at least \S+ GB, and 6\.0 GB are free in memory; "
+    for make in (go1exp.make, partial(gymnasium.make_vec, "Go1-v0")):
+        with pytest.raises(ConfigError, match=f"{words}1000000 at most would fit$"):
+            make(overrides=QUIET, num_envs=number)
+
+
 def test_numbers_of_numpy_are_whole_numbers_too() -> None:
     numbers: dict[str, Any] = {"num_envs": np.int64(2), "seed": np.uint8(3)}
     assert go1exp.make(QUIET, **numbers).reset().shape == (2, 48)
@@ -294,13 +306,29 @@ def test_an_action_of_another_shape_is_refused(shape: tuple[int, ...]) -> None:
         env.step(np.zeros(shape, np.float32))
 
 
-@pytest.mark.parametrize("action", [None, "still", {}, np.array([None] * 12), np.array(["0"] * 12)])
+@pytest.mark.parametrize(
+    "action", [None, "still", {}, np.array([None] * 12), np.array(["0"] * 12), [[0.0], [0.0, 1.0]], 1j * np.ones(12)]
+)
 def test_an_action_without_numbers_is_refused_by_name(action: Any, make_core: Make) -> None:
     env = Go1Env(QUIET)
     env.reset(seed=0)
     for step in (env.step, quiet_batch(make_core(*QUIET)).step):
         with pytest.raises(ValueError, match=r"^action: must be an array of numbers, not"):
             step(action)
+
+
+@pytest.mark.parametrize(
+    "action", [np.arange(12.0)[::-1], np.arange(12.0, dtype=">f4"), np.arange(12, dtype=np.longdouble), list(range(12))]
+)
+def test_numbers_of_any_kind_are_actions(action: Any, make_core: Make) -> None:
+    env = quiet_batch(make_core(*QUIET))
+    env.step_async([action])
+    np.testing.assert_array_equal(env._actions[0].numpy(), np.array(action, np.float32))
+
+
+def test_what_else_fails_of_an_action_is_not_called_its_numbers(make_core: Make) -> None:
+    with pytest.raises(NotImplementedError, match="meta"):
+        quiet_batch(make_core(*QUIET)).step_async(torch.zeros(1, 12, device="meta"))
 
 
 # Stable-Baselines3

@@ -271,6 +271,32 @@ def test_a_time_without_an_end_or_without_a_step_is_refused(
     assert caught.value.problems[0].startswith(words)
 
 
-def test_an_episode_without_an_end_is_no_multiple_of_a_step() -> None:
-    with pytest.raises(ConfigError, match=r"^sim\.episode_s = 1e\+308: must be a whole multiple of sim\.policy_dt"):
-        parse_train(compose("train", ["sim.episode_s=1e308"]))
+@pytest.mark.parametrize(
+    ("key", "value", "bound"),
+    [
+        ("sim.episode_s", 1e308, "less than or equal to 1000000000"),
+        ("sim.episode_s", 1e300, "less than or equal to 1000000000"),
+        ("sim.physics_dt", 1e-12, "greater than or equal to 0.00001"),
+        ("terrain.tile_size", 1e300, "less than or equal to 10000"),
+        ("terrain.border", 1e300, "less than or equal to 10000"),
+        ("terrain.resolution", 1e-300, "greater than or equal to 0.001"),
+        ("terrain.rows", 10**30, "less than or equal to 1000000000"),
+        ("backend.threads", 10**6, "less than or equal to 1024"),
+        ("ppo.iterations", 10**30, "less than or equal to 1000000000"),
+        ("ppo.coarse_physics", 10**14, "less than or equal to 10000"),
+        ("eval.seconds", 1e300, "less than or equal to 1000000000"),
+    ],
+)
+def test_a_setting_beyond_all_measure_is_refused_by_its_key(key: str, value: float, bound: str) -> None:
+    with pytest.raises(ConfigError, match=rf"^{re.escape(f'{key} = {value}')}: input should be {bound}$"):
+        parse_train(compose("train", ["terrain=rough", f"{key}={value}"]))
+
+
+def test_robots_of_an_evaluation_that_do_not_fit_are_refused_with_or_without_measures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(memory, "free", lambda: FREE)
+    given = compose("eval", ["policy=clock", "episodes=1000000", "measures=[]"])
+    with pytest.raises(ConfigError, match=r"^episodes = 1000000: with 12000000 robots it takes .* at most would fit$"):
+        importlib.import_module("go1exp.cli.evaluate").APP.task(begin("eval", given))

@@ -68,7 +68,7 @@ def test_what_a_training_takes_grows_with_all_that_it_holds() -> None:
 
 
 def test_what_does_not_fit_is_refused_with_both_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(preflight, "_available", lambda device: 8_000_000_000)
+    monkeypatch.setattr(preflight, "free_on", lambda device: 8_000_000_000)
     preflight.check_memory(config("ppo.num_envs=4096"), CPU)
     with pytest.raises(ConfigError, match=r"at least \d+\.\d GB, and 8\.0 GB are free in memory") as caught:
         preflight.check_memory(config("ppo.num_envs=10000000"), CPU)

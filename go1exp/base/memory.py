@@ -5,6 +5,7 @@ This module imports nothing of the package.
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 
@@ -32,7 +33,9 @@ def too_long(seconds: float, rate: float) -> str | None:
 
 def too_much(needed: float, available: float) -> str:
     """Word that so many bytes are needed at least where fewer are free."""
-    return f"takes at least {needed / 1e9:.1f} GB, and {available / 1e9:.1f} GB are free in memory"
+    amount = needed / 1e9 if needed < 1e300 else math.inf
+    least = f"{amount:.1f}" if amount < 1e6 else f"{amount:.1e}"
+    return f"takes at least {least} GB, and {available / 1e9:.1f} GB are free in memory"
 
 
 def _of_machine() -> int | None:

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-from pydantic import Field
+from typing import TYPE_CHECKING, Any, Literal
 
 from go1exp.base.files import write_json
 from go1exp.cli.app import App, parse, spinner
 from go1exp.cli.record import RecordSettings
 from go1exp.config.compose import compose
 from go1exp.config.schema import settings as schema
-from go1exp.config.schema.registry import ConfigError, Count, Positive
+from go1exp.config.schema.physics import Threads
+from go1exp.config.schema.registry import ConfigError, Count, Duration
 
 if TYPE_CHECKING:
     from go1exp.evaluate.bench.env import Measured
@@ -38,8 +37,8 @@ class BenchSettings:
     suite: Literal["env", "train", "actuator", "deploy", "mpc", "report", "gpu"]
     num_envs: Count
     rounds: Count
-    seconds: Positive
-    threads: Annotated[int, Field(ge=0)]
+    seconds: Duration
+    threads: Threads
     overrides: tuple[str, ...]
     out: str | None
 
@@ -77,6 +76,7 @@ def _task(container: dict[str, Any]) -> None:
     settings = parse(BenchSettings, container)
     show = spinner(settings.rounds, f"measuring {settings.suite}", at_once=True)
 
+    from go1exp.sim.env.engine import refuse_too_many
     from go1exp.sim.task import parse_train
 
     on_gpu = settings.suite == "gpu"
@@ -87,6 +87,7 @@ def _task(container: dict[str, Any]) -> None:
 
     from go1exp.evaluate.bench import env
 
+    refuse_too_many("num_envs", settings.num_envs, config.task.backend)
     much = env.Measured(settings.num_envs, settings.rounds, settings.seconds, show)
     if settings.suite == "env":
         figures = env.run(config.task, overrides, much)

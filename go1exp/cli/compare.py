@@ -15,6 +15,7 @@ from go1exp.cli.evaluate import RATES, note_replaced, refuse
 from go1exp.cli.places import writable
 from go1exp.cli.subjects import Named, Variation, agent, varied
 from go1exp.config.schema import settings as schema
+from go1exp.config.schema.physics import PhysicsStep
 from go1exp.config.schema.registry import ConfigError
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ class CompareSettings:
     subjects: Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=2)]
     same_robot: bool
     seed: Annotated[int, Field(ge=0)]
-    physics_dt: Annotated[float, Field(gt=0, le=0.02)] | None
+    physics_dt: PhysicsStep | None
     folder: Annotated[str, Field(min_length=1)]
 
     def __post_init__(self) -> None:

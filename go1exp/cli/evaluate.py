@@ -16,6 +16,7 @@ from go1exp.cli.places import writable
 from go1exp.cli.subjects import Named, agent
 from go1exp.config.choices import config_folder, load
 from go1exp.config.schema import settings as schema
+from go1exp.config.schema.physics import PhysicsStep
 from go1exp.config.schema.registry import ConfigError, Count, Duration, FolderName, NonNegative, Speed, Term, bind_list
 
 if TYPE_CHECKING:
@@ -88,7 +89,7 @@ class EvalSettings:
     train_ground: bool
     trunk_velocity: Literal["exact", "estimated"]
     policy_dt: Annotated[float, Field(gt=0, le=0.1)] | None
-    physics_dt: Annotated[float, Field(gt=0, le=0.02)] | None
+    physics_dt: PhysicsStep | None
     measures: Any
     delay_margin: bool
     seed: Annotated[int, Field(ge=0)]

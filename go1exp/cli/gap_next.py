@@ -59,7 +59,7 @@ class GapLoopSettings(RecordingConfig):
     """
 
     excitation: Any = ()
-    physics_dt: Annotated[float, Field(gt=0, le=0.002)]
+    physics_dt: Annotated[float, Field(ge=1e-5, le=0.002)]
     rounds: Annotated[int, Field(ge=0)]
     search: GapSettings
     design: DesignSettings

@@ -18,6 +18,7 @@ from go1exp.cli.places import shipped_policies
 from go1exp.cli.subjects import Named, agent, word
 from go1exp.config.choices import choice_files, config_folder, load
 from go1exp.config.schema import settings as schema
+from go1exp.config.schema.physics import PhysicsStep
 from go1exp.config.schema.registry import ConfigError, Duration, FolderName, Speed
 from go1exp.config.schema.settings import subset
 from go1exp.deploy.sim_robot import SimConfig, SimSettings
@@ -78,7 +79,7 @@ class PlaySettings:
     randomize: bool
     push: bool
     train_ground: bool
-    physics_dt: Annotated[float, Field(gt=0, le=0.02)] | None
+    physics_dt: PhysicsStep | None
     seed: Annotated[int, Field(ge=0)]
     out: str | None
 

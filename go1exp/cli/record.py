@@ -48,7 +48,7 @@ class RecordSettings(RecordingConfig):
     run: str | None
     policy: str | None
     episodes: Count
-    physics_dt: Annotated[float, Field(gt=0, le=0.002)]
+    physics_dt: Annotated[float, Field(ge=1e-5, le=0.002)]
     out: str
 
     def __post_init__(self) -> None:

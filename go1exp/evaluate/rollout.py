@@ -21,7 +21,7 @@ from go1exp.evaluate.recorder import Recorder, bytes_per_second
 from go1exp.mdp.commands import FixedVelocity
 from go1exp.mdp.measures import measured
 from go1exp.sim.env.core import Go1Core
-from go1exp.sim.env.engine import make_backend
+from go1exp.sim.env.engine import make_backend, refuse_too_many
 from go1exp.sim.physics.agreement import Check, require, robots_needed
 from go1exp.sim.physics.scene import build_model
 from go1exp.sim.task import TaskConfig, time_rules
@@ -102,7 +102,7 @@ def evaluate(
     agent = ControllerAgent("", task, controller) if controller else PolicyAgent("", task, cast(Policy, policy))
     imu = config.trunk_velocity == "estimated" or agent.senses
     task = evaluation_task(task, config)
-    _refuse_too_long(config, bytes_per_second(task, count) if measures else 0.0, count)
+    _refuse_too_long(config, task, bytes_per_second(task, count) if measures else 0.0)
     dt = task.sim.policy_dt
     steps, settle = _steps(config, dt)
     checks = require_agreement(task)
@@ -151,8 +151,10 @@ def _steps(config: EvalConfig, dt: float) -> tuple[int, int]:
     return steps, settle
 
 
-def _refuse_too_long(config: EvalConfig, rate: float, count: int) -> None:
-    """Raise TooLongError if ``rate`` B/s of what measures need of ``count`` robots do not fit into memory."""
+def _refuse_too_long(config: EvalConfig, task: TaskConfig, rate: float) -> None:
+    """Raise ConfigError if the robots do not fit into memory; TooLongError if ``rate`` B/s of measures do not."""
+    refuse_too_many("episodes", config.episodes, task.backend, len(config.commands))
+    count = len(config.commands) * config.episodes
     seconds, available = config.seconds - config.settle_s, memory.free()
     if available is None or seconds * rate <= available:
         return

@@ -15,8 +15,8 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
 
 from go1exp.base.errors import EXIT_CODES as EXIT_CODES
-from go1exp.config.schema.physics import ContactConfig
-from go1exp.config.schema.registry import STRICT, Fraction, NonNegative, Positive
+from go1exp.config.schema.physics import ContactConfig, Threads
+from go1exp.config.schema.registry import STRICT, Count, Fraction, NonNegative, Positive
 
 Verdict = Literal["no gap", "explained", "partly explained", "unexplained", "not excited", "bad log"]
 
@@ -30,7 +30,6 @@ DEFAULT_CLOCK: Clock = "recorded"
 """The clock that is taken where two were compared and neither is better: it asks nothing of the speeds."""
 
 Share = Annotated[float, Field(gt=0, lt=1)]
-Count = Annotated[int, Field(ge=1)]
 
 
 ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180}
@@ -122,7 +121,7 @@ class GapSettings:
     certified: Fraction = 0.8
     overlays: Annotated[int, Field(ge=0)] = 4
     max_rows: Count = 1024
-    threads: Annotated[int, Field(ge=0)] = 1
+    threads: Threads = 1
     seed: Annotated[int, Field(ge=0)] = 0
 
 

@@ -21,6 +21,7 @@ from go1exp.config.schema.physics import BACKENDS, MUJOCO_CONTACT, BackendConfig
 from go1exp.config.schema.registry import (
     STRICT,
     ConfigError,
+    Duration,
     FolderName,
     NonNegative,
     Positive,
@@ -55,9 +56,9 @@ class SimConfig(Strict):
         spread_starts: first episodes begin at random times, so that not all end together.
     """
 
-    physics_dt: Annotated[float, Field(gt=0, le=0.02)]
+    physics_dt: Annotated[float, Field(ge=1e-5, le=0.02)]
     policy_dt: Annotated[float, Field(gt=0, le=0.1)]
-    episode_s: Positive
+    episode_s: Duration
     spread_starts: bool
 
     @property

@@ -17,7 +17,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import AfterValidator
+from pydantic import AfterValidator, Field
 
 from go1exp.config.schema.registry import Count, CountOrZero, NonNegative, Positive, Strict, ordered
 from go1exp.mdp.ground import GroundHeight
@@ -83,9 +83,9 @@ class TerrainConfig(Strict):
     kind: Literal["flat", "tiles"] = "flat"
     rows: Count = 10
     cols: Count = 20
-    tile_size: Positive = 8.0
-    border: NonNegative = 20.0
-    resolution: Positive = 0.1
+    tile_size: Annotated[float, Field(gt=0, le=1e4)] = 8.0
+    border: Annotated[float, Field(ge=0, le=1e4)] = 20.0
+    resolution: Annotated[float, Field(ge=1e-3, le=1e4)] = 0.1
     platform: Positive = 2.0
     seed: CountOrZero = 0
     boxes_proportion: NonNegative = 0.3

@@ -17,6 +17,7 @@ from go1exp.mdp.commands import AXES
 from go1exp.mdp.curricula import YAW_ARM
 from go1exp.sim.effects.rules import nested_actuators
 from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.engine import device_of, free_on, robot_bytes
 from go1exp.sim.task import TrainConfig
 from go1exp.train import metrics
 from go1exp.train.schedule import check_measures
@@ -41,7 +42,7 @@ def check(config: TrainConfig) -> None:
     warn_of_idle_curriculum(config)
     check_shares(config)
     check_measures(config)
-    check_memory(config, engine_device(config))
+    check_memory(config, device_of(config.task.backend))
     metrics.check_account(config.logger)
     if any("file" in term.parameters for term, _ in nested_actuators(config.task.actuator)):
         Go1Core(config.task, 1)
@@ -64,12 +65,6 @@ def warn_of_idle_curriculum(config: TrainConfig) -> None:
     }
     for reason in (reason for reason, holds in reasons.items() if holds and task.curriculum):
         warnings.warn(f"curriculum.{task.curriculum[0].key}: promotes no robot; {reason}", stacklevel=3)
-
-
-def engine_device(config: TrainConfig) -> torch.device:
-    """Return the device on which the environments live."""
-    backend = config.task.backend
-    return torch.device(backend.device if isinstance(backend, WarpBackend) else "cpu")
 
 
 def check_shares(config: TrainConfig) -> None:
@@ -121,17 +116,10 @@ def check_devices(config: TrainConfig) -> None:
         raise ConfigError(problems)
 
 
-CPU_ROBOT_BYTES = 6000
-"""One more robot on the CPU: physics state, own model fields, the MDP's tensors (measured: 6.2 kB at 4096)."""
-
 SAMPLE_BYTES = 12
 """A sample of the ground: float64 as it is built, float32 in the engine."""
 
-CONTACT_BYTES = 100
-"""A contact that MuJoCo Warp has room for: positions, frame, solver parameters, geoms."""
-
 FLOAT = 4
-DEGREES_OF_FREEDOM = 6 + robot.NUM_JOINTS
 
 
 def needed_bytes(config: TrainConfig) -> int:
@@ -141,10 +129,8 @@ def needed_bytes(config: TrainConfig) -> int:
     Robots; the rollout once (observations of one number a term, actions, their means, six numbers a step); the layers'
     outputs of one minibatch, and of its mirror image, which wait for the backward pass.
     """
-    ppo, backend, devices = config.ppo, config.task.backend, config.process.devices
-    per_robot = CPU_ROBOT_BYTES
-    if isinstance(backend, WarpBackend):
-        per_robot = FLOAT * DEGREES_OF_FREEDOM * backend.njmax + CONTACT_BYTES * backend.nconmax
+    ppo, devices = config.ppo, config.process.devices
+    per_robot = robot_bytes(config.task.backend)
     row = len(config.task.observation) + len(config.task.critic) + 2 * robot.NUM_JOINTS + 6
     rollout = ppo.num_envs * ppo.steps
     samples = rollout // ppo.minibatches * (2 if ppo.symmetry else 1)
@@ -162,7 +148,7 @@ def check_memory(config: TrainConfig, device: torch.device) -> None:
     Raises:
         ConfigError: with what it takes and what there is.
     """
-    needed, available = needed_bytes(config), _available(device)
+    needed, available = needed_bytes(config), free_on(device)
     ground, free = config.task.terrain, memory.free()
     samples = math.prod(ground.shape) if ground.kind == "tiles" else 0
     if free is not None and SAMPLE_BYTES * samples > free:
@@ -177,10 +163,3 @@ def check_memory(config: TrainConfig, device: torch.device) -> None:
         where = f"on {device}" if device.type == "cuda" else "in memory"
         amounts = f"at least {needed / 1e9:.1f} GB, and {available / 1e9:.1f} GB are free {where}"
         raise ConfigError([f"{values[first]}: with {' and '.join(values[n] for n in others)} it takes {amounts}"])
-
-
-def _available(device: torch.device) -> int | None:
-    """Return the free memory of a device, B; None where it is unknown."""
-    if device.type == "cuda":
-        return int(torch.cuda.mem_get_info(device)[0])
-    return memory.free()

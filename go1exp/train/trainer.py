@@ -24,6 +24,7 @@ from go1exp.config.schema.physics import fitting_step
 from go1exp.config.schema.registry import Expected
 from go1exp.sim.effects.rules import nested_actuators
 from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.engine import device_of
 from go1exp.sim.env.faults import NumericalFault
 from go1exp.sim.env.sb3_env import Go1VecEnv
 from go1exp.sim.task import TaskConfig, TrainConfig, parse_train
@@ -186,7 +187,7 @@ def train(config: TrainConfig, container: dict[str, Any], run: Path, first: Weig
         NumericalFault: when a number stops being finite; ``fault.npz`` holds the moment.
         OSError: when metrics or a checkpoint cannot be written; what was saved before is untouched.
     """
-    backend = "nccl" if preflight.engine_device(config).type == "cuda" else "gloo"
+    backend = "nccl" if device_of(config.task.backend).type == "cuda" else "gloo"
     with together(config.process.devices, train_as_member, container, run, backend) as group:
         ppo = _begun(config, run, first, group)
         logger = metrics.make_logger(config.logger, run, ppo.iteration, container, ppo.num_timesteps)

@@ -10,6 +10,12 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from go1exp.config.schema.registry import Strict, as_json, one_of
 
+Threads = Annotated[int, Field(ge=0, le=1024)]
+"""Of the physics or of torch; 0 takes all cores."""
+
+PhysicsStep = Annotated[float, Field(ge=1e-5, le=0.02)]
+"""A physics step, s."""
+
 
 class Engine(Strict):
     """What the settings of every engine tell."""
@@ -44,7 +50,7 @@ class CpuBackend(Engine):
     """
 
     name: Literal["cpu"]
-    threads: Annotated[int, Field(ge=0)]
+    threads: Threads
 
     def as_reference(self) -> CpuBackend:
         """Return these settings, with their threads."""
@@ -101,7 +107,7 @@ class PhysxBackend(Engine):
     """
 
     name: Literal["physx"]
-    threads: Annotated[int, Field(ge=0)]
+    threads: Threads
     solver: Literal["tgs", "pgs"]
     position_iterations: Annotated[int, Field(ge=1, le=255)]
     velocity_iterations: Annotated[int, Field(ge=0, le=255)]

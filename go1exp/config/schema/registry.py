@@ -42,8 +42,8 @@ Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Gain = Annotated[float, Field(ge=0, le=1023)]
 """Of a motor, N m/rad or N m s/rad; at most what the Go1's packets carry."""
-Count = Annotated[int, Field(ge=1)]
-CountOrZero = Annotated[int, Field(ge=0)]
+Count = Annotated[int, Field(ge=1, le=10**9)]
+CountOrZero = Annotated[int, Field(ge=0, le=2**32 - 1)]
 Duration = Annotated[float, Field(gt=0, le=1e9)]
 """A length of time of which steps are counted, s; at most 32 years."""
 Fraction = Annotated[float, Field(ge=0, le=1)]

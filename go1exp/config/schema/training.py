@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from go1exp.config.schema.registry import Count, CountOrZero, Fraction, NonNegative, Positive, Strict
+from go1exp.config.schema.registry import Count, CountOrZero, Duration, Fraction, NonNegative, Positive, Strict
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class PPOConfig(Strict):
     matmul_precision: Literal["highest", "bf16", "auto"]
     symmetry: bool = False  # runs of older versions do not have the key
     max_kl: Positive | None = None  # nor this one
-    coarse_physics: Count = 1
+    coarse_physics: Annotated[int, Field(ge=1, le=10_000)] = 1
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,7 @@ class EvalDuring(Strict):
     y: tuple[float, ...] = (0.5,)
     yaw: tuple[float, ...] = (1.0,)
     episodes: Count = 8
-    seconds: Positive = 8.0
+    seconds: Duration = 8.0
     settle_s: NonNegative = 2.0
     noise: bool = True
     randomize: bool = True
@@ -174,7 +174,7 @@ class VideoDuring(Strict):
     """
 
     every: CountOrZero = 0
-    seconds: Positive = 6.0
+    seconds: Duration = 6.0
     velocity: tuple[float, float, float] = (1.0, 0.0, 0.0)
 
 

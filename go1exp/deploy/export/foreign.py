@@ -23,6 +23,7 @@ from go1exp.config.hydra_adapter import read_yaml
 from go1exp.config.schema import settings as schema
 from go1exp.config.schema.history import frame_width, frames_of, width
 from go1exp.config.schema.joint_values import JointValues, spread
+from go1exp.config.schema.physics import PhysicsStep
 from go1exp.config.schema.registry import ConfigError, Positive, unknown_name
 from go1exp.deploy.export.graph import Observing, computed
 from go1exp.sim.task import TrainConfig, parse_train
@@ -142,7 +143,7 @@ class Spec:
     kd: JointValues = 0.5
     action_scale: JointValues = 0.25
     action_clip: Positive = 100.0
-    physics_dt: Annotated[float, Field(gt=0, le=0.02)] = 0.005
+    physics_dt: PhysicsStep = 0.005
     decimation: Annotated[int, Field(ge=1, le=100)] = 4
     history: Annotated[int, Field(ge=1, le=64)] = 1
     history_order: Literal["newest_first", "oldest_first"] = "oldest_first"

@@ -12,9 +12,8 @@ from pydantic import ConfigDict, Field
 
 import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
 from go1exp.base.errors import Expected
-from go1exp.config.schema.registry import STRICT, NonNegative, Positive, Term, bind, members
+from go1exp.config.schema.registry import STRICT, Count, CountOrZero, NonNegative, Positive, Term, bind, members
 from go1exp.gap.data.windows import Windows
-from go1exp.gap.result import Count
 from go1exp.logs.excitations import ExcitationError, Motion
 
 if TYPE_CHECKING:
@@ -60,7 +59,7 @@ class DesignSettings:
 
     seconds: Annotated[float, Field(ge=2, le=60)] = 6.0
     designs: Count = 120
-    refine: Annotated[int, Field(ge=0)] = 2
+    refine: CountOrZero = 2
     gains: Annotated[tuple[tuple[Positive, NonNegative], ...], Field(min_length=1)] = (
         *((1.0, 1.0), (1.0, 2.0), (0.5, 1.0), (1.5, 1.0)),
     )

@@ -8,6 +8,7 @@ from typing import Any
 
 from go1exp.config.schema.registry import ConfigError
 from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.engine import refuse_too_many
 from go1exp.sim.task import TaskConfig, parse_train
 
 
@@ -35,7 +36,9 @@ def make(
         go1exp.config.schema.registry.ConfigError: if an override, a number of robots or a seed is invalid.
     """
     num_envs, seed = whole("num_envs", num_envs, 1), whole("seed", seed, 0)
-    return Go1Core(task_of(overrides), num_envs, seed, noise=noise, spread_starts=spread_starts)
+    task = task_of(overrides)
+    refuse_too_many("num_envs", num_envs, task.backend)
+    return Go1Core(task, num_envs, seed, noise=noise, spread_starts=spread_starts)
 
 
 def task_of(overrides: Any) -> TaskConfig:

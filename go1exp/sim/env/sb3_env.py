@@ -41,10 +41,18 @@ def spaces(core: Go1Core, action_box: float | None = None) -> tuple[gym.spaces.B
 
 def action_tensor(actions: Any, device: torch.device) -> torch.Tensor:
     """Return actions as a tensor; raise ValueError if they are not numbers."""
-    try:
-        return torch.as_tensor(actions, dtype=torch.float32, device=device)
-    except (TypeError, ValueError, RuntimeError):
-        raise ValueError(f"action: must be an array of numbers, not {type(actions).__name__} {actions!r:.80}") from None
+    given = actions
+    if not isinstance(actions, torch.Tensor):
+        try:
+            given = np.asarray(actions)
+        except ValueError:  # rows of different lengths
+            given = np.array(None)
+        if given.dtype.kind in "biuf":
+            with np.errstate(over="ignore"):  # infinite; the step names it
+                given = torch.from_numpy(np.asarray(given, np.float32, order="C"))
+    if not isinstance(given, torch.Tensor) or given.is_complex():
+        raise ValueError(f"action: must be an array of numbers, not {type(actions).__name__} {actions!r:.80}")
+    return given.to(device, torch.float32)
 
 
 class Go1VecEnv(VecEnv):

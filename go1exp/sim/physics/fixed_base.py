@@ -58,8 +58,8 @@ def build_fixed_base(
     held = {joint.name: joint for joint in spec.joints if joint.name not in joints}
     ties = [e for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT and {e.name1, e.name2} & held.keys()]
     # A joint that is held cannot mimic another.
-    seen = (*spec.excludes, *spec.pairs, *spec.cameras, *spec.lights, *spec.skins, *spec.flexes)
-    for part in (*ties, *held.values(), *spec.actuators, *spec.sensors, *spec.keys, *seen):
+    references = (*spec.excludes, *spec.pairs, *spec.cameras, *spec.lights, *spec.skins, *spec.flexes)
+    for part in (*ties, *held.values(), *spec.actuators, *spec.sensors, *spec.keys, *references):
         spec.delete(part)
     for body in spec.bodies:
         body.simple = False  # a link whose mass an effect moves is not what MuJoCo calls simple
