@@ -130,6 +130,8 @@ JOINT_VELOCITY = (
         (GRAVITY % "quaternion: inverse", "gravity frame: quaternion=wxyz"),
         (GRAVITY % "quaternion: xyzw", "quaternion order: quaternion=wxyz"),
         (JOINT_VELOCITY, "joint_velocity scale=1"),
+        ("kp: 60.0", "gains: kp x 1/3"),
+        ("kd: 2.0", "gains: kd x 1/3"),
     ],
 )
 def test_a_wrong_contract_is_named(line: str, likely: str, tmp_path: Path) -> None:

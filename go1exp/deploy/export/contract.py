@@ -31,7 +31,7 @@ from go1exp.deploy.export.foreign import (
 from go1exp.deploy.export.foreign_graph import Network, compose_graph
 from go1exp.deploy.export.graph import ExportError
 from go1exp.deploy.runtime import bundle
-from go1exp.deploy.runtime.metadata import Trained
+from go1exp.deploy.runtime.metadata import MAX_GAIN, Trained
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TrainConfig
 
@@ -257,6 +257,15 @@ def _other_histories(spec: Spec) -> Iterator[tuple[str, Spec]]:
             yield text, dataclasses.replace(spec, history_order=order, history_layout=layout)
 
 
+def _other_gains(spec: Spec) -> Iterator[tuple[str, Spec]]:
+    """Yield contracts with a third and three times the gains, as far as the motors take them."""
+    for key in ("kp", "kd"):
+        for text, factor in (("1/3", 1.0 / 3.0), ("3", 3.0)):
+            gains = factor * spec.joints(key)
+            if np.all(gains <= MAX_GAIN):
+                yield f"gains: {key} x {text}", dataclasses.replace(spec, **{key: tuple(gains.tolist())})
+
+
 def _other_readings(observed: Observed) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield what a term may be in place of what is stated: name, and attributes of ``Observed``."""
     name = _name(observed)
@@ -342,12 +351,15 @@ def _likelier(stated: Outcome, config: TrainConfig, spec: Spec, network: Network
         return [], []
     others = list(alternatives(spec))
     outcomes, _, _ = drive(config, [other for _, other in others], network)
+    for name, other in _other_gains(spec):  # robots of a batch have the same gains
+        others.append((name, other))
+        outcomes += drive(config_of(other)[1], [other], network)[0]
     least = -np.inf if stated.falls else max(stated.follows + BETTER, 1.0 - PART * (1.0 - stated.follows))
     calm = min(PART * stated.sways, stated.sways - STEADIER)
     likely, alike = [], []
     for (name, _), one in zip(others, outcomes, strict=True):
-        # stance and stiffness change how a robot sways, whatever its policy reads; a sign turns the stance, too
-        read = not name.startswith(("default pose", "scale: action", "sign"))
+        # stance and gains change how a robot sways, whatever its policy reads; a sign turns the stance, too
+        read = not name.startswith(("default pose", "gains", "scale: action", "sign"))
         steadier = read and one.sways < calm and one.follows > stated.follows - STEADIER
         works = not one.falls and (one.follows > WALKING or one.sways < STILL)
         if works and (one.follows > least or steadier):
