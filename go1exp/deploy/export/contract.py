@@ -261,9 +261,9 @@ def _other_gains(spec: Spec) -> Iterator[tuple[str, Spec]]:
     """Yield contracts with a third and three times the gains, as far as the motors take them."""
     for key in ("kp", "kd"):
         for text, factor in (("1/3", 1.0 / 3.0), ("3", 3.0)):
-            gains = factor * spec.joints(key)
-            if np.all(gains <= MAX_GAIN):
-                yield f"gains: {key} x {text}", dataclasses.replace(spec, **{key: tuple(gains.tolist())})
+            gains: dict[str, Any] = {key: tuple((factor * spec.joints(key)).tolist())}
+            if max(gains[key]) <= MAX_GAIN:
+                yield f"gains: {key} x {text}", dataclasses.replace(spec, **gains)
 
 
 def _other_readings(observed: Observed) -> Iterator[tuple[str, dict[str, Any]]]:
