@@ -210,7 +210,7 @@ class AdaptivePPO(PPO):
     def __init__(self, config: PPOConfig, env: VecEnv, seed: int, device: str) -> None:
         self.config = config
         self.iteration = 0
-        self.after_iteration: Callable[[AdaptivePPO], None] = lambda ppo: None
+        self.after_iteration: Callable[[AdaptivePPO], object] = lambda ppo: None
         terms = env.core.terms if isinstance(env, Go1VecEnv) else None
         assert terms or not config.symmetry, "only a robot's observations have mirror images"
         self.mirror = mirror_of(terms.observed) if config.symmetry and terms else None

@@ -98,12 +98,12 @@ def _unwrapped(recording: Recording, wraps: list[Wrong]) -> Recording:
     if not recording.has("q"):
         return recording
 
-    def add(name: str, found: Turns | None, unit: str) -> np.ndarray:
-        if found is not None:
-            wraps.append((name, found[0] != 0.0, WRAPS.format(found[1], unit)))
-            y = recording.channels[name] + found[0] * found[1]
+    def add(name: str, turns: Turns | None, unit: str) -> np.ndarray:
+        if turns is not None:
+            wraps.append((name, turns[0] != 0.0, WRAPS.format(turns[1], unit)))
+            y = recording.channels[name] + turns[0] * turns[1]
             target = recording.channels.get(name.replace("q_", "q_target_", 1), y)  # says which turn is none
-            changed[name] = y + found[1] * np.round(np.median(target - y) / found[1])
+            changed[name] = y + turns[1] * np.round(np.median(target - y) / turns[1])
         return changed.get(name, recording.channels[name])
 
     changed: dict[str, np.ndarray] = {}

@@ -30,8 +30,8 @@ def one_motion(clock: np.ndarray, x: np.ndarray, times: np.ndarray, y: np.ndarra
     inside = (times >= clock[0]) & (times <= clock[-1])
     if len(clock) < 3 or not inside.any():
         return False
-    own = _off_line(clock[::2], x[::2], clock[1::2], x[1::2])
-    return _off_line(clock, x, times[inside], y[inside]) <= NEAR * own + 1e-9
+    spread = _off_line(clock[::2], x[::2], clock[1::2], x[1::2])
+    return _off_line(clock, x, times[inside], y[inside]) <= NEAR * spread + 1e-9
 
 
 def _off_line(clock: np.ndarray, x: np.ndarray, times: np.ndarray, y: np.ndarray) -> float:
