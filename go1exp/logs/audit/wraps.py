@@ -7,7 +7,7 @@ import numpy as np
 import go1exp.logs.audit.limits as limits
 
 Turns = tuple[np.ndarray, float]
-"""Turns (T,) of the counter that readings lack, of which most have none, and the range of the counter."""
+"""Turns (T,) of the counter to be added to each reading, mostly 0, and the range of the counter."""
 
 
 def wrapped_angle(t: np.ndarray, x: np.ndarray, fastest: float) -> Turns | None:
