@@ -933,7 +933,7 @@ def test_a_counter_that_wraps_is_called_so_with_its_range_and_no_sign_is_called_
     (found,) = report.by_check("impossible")
     assert found.channel == channel
     assert found.size == pytest.approx(1 - np.unique(turns, return_counts=True)[1].max() / len(x))
-    (size,) = re.findall(r"wraps, as it jumps by its full range of (\S+) rad", found.message)
+    (size,) = re.findall(r"wraps at its range of (\S+) rad", found.message)
     assert float(size) == pytest.approx(whole, rel=0.02)
 
 

@@ -226,12 +226,13 @@ def test_a_training_says_when_its_schedule_begins_and_that_it_never_began(
     soon = "when: {measure: rollout/length, above: 0, iterations: 2}"
     never = "when: {measure: train/std, below: 0.001, iterations: 1, also: {measure: rollout/length, above: 0}}"
     train(tmp_path, [*FLAT, SIX, ramp(f"{WEIGHT}, over: 1, {soon}"), ramp(f"{STIFF}, over: 1, {never}", "y")])
-    said = [line for line in capsys.readouterr().err.splitlines() if "schedule" in line]
-    assert said[0] == "iteration 2: the schedule begins x"
+    said = [line for line in capsys.readouterr().err.splitlines() if "ramps" in line]
+    assert said[0] == "iteration 2: these ramps begin: x"
+    never_begun = "these ramps have not begun: y (waiting for train/std <= 0.001"
     for line, iteration in zip(said[1:], (3, 6), strict=True):
         row = rows(tmp_path / "metrics.csv")[iteration - 1]
-        assert line.startswith(f"warning: iteration {iteration} of 6, and of the schedule y wait for train/std")
-        assert f"<= 0.001 (it is {float(row['train/std']):.3g}) and rollout/length >= 0.0 (it is " in line
+        assert line.startswith(f"warning: iteration {iteration}/6: {never_begun}")
+        assert f"(now {float(row['train/std']):.3g}) and rollout/length >= 0.0 (now " in line
 
 
 @pytest.mark.parametrize(

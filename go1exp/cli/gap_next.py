@@ -16,6 +16,7 @@ from go1exp.cli.places import long_enough, read_all, writable
 from go1exp.cli.record import RIG, _motions
 from go1exp.cli.verbs import command
 from go1exp.config.schema import settings as schema
+from go1exp.config.schema.physics import RecordedStep
 from go1exp.config.schema.registry import ConfigError, FolderName
 from go1exp.gap.design.plan import DesignSettings
 from go1exp.gap.result import GapSettings
@@ -59,7 +60,7 @@ class GapLoopSettings(RecordingConfig):
     """
 
     excitation: Any = ()
-    physics_dt: Annotated[float, Field(ge=1e-5, le=0.002)]
+    physics_dt: RecordedStep
     rounds: Annotated[int, Field(ge=0)]
     search: GapSettings
     design: DesignSettings

@@ -19,6 +19,7 @@ from go1exp.cli.places import files_of, names_of, trained, writable
 from go1exp.cli.verbs import command
 from go1exp.config.compose import compose
 from go1exp.config.schema import settings as schema
+from go1exp.config.schema.physics import RecordedStep
 from go1exp.config.schema.registry import ConfigError, Count, FolderName, Term, bind_list
 from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
 from go1exp.logs.record.plan import RecordingConfig
@@ -48,7 +49,7 @@ class RecordSettings(RecordingConfig):
     run: str | None
     policy: str | None
     episodes: Count
-    physics_dt: Annotated[float, Field(ge=1e-5, le=0.002)]
+    physics_dt: RecordedStep
     out: str
 
     def __post_init__(self) -> None:

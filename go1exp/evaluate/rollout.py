@@ -102,7 +102,7 @@ def evaluate(
     agent = ControllerAgent("", task, controller) if controller else PolicyAgent("", task, cast(Policy, policy))
     imu = config.trunk_velocity == "estimated" or agent.senses
     task = evaluation_task(task, config)
-    _refuse_too_long(config, task, bytes_per_second(task, count) if measures else 0.0)
+    _check_memory(config, task, bytes_per_second(task, count) if measures else 0.0)
     dt = task.sim.policy_dt
     steps, settle = _steps(config, dt)
     checks = require_agreement(task)
@@ -151,7 +151,7 @@ def _steps(config: EvalConfig, dt: float) -> tuple[int, int]:
     return steps, settle
 
 
-def _refuse_too_long(config: EvalConfig, task: TaskConfig, rate: float) -> None:
+def _check_memory(config: EvalConfig, task: TaskConfig, rate: float) -> None:
     """Raise ConfigError if the robots do not fit into memory; TooLongError if ``rate`` B/s of measures do not."""
     refuse_too_many("episodes", config.episodes, task.backend, len(config.commands))
     count = len(config.commands) * config.episodes

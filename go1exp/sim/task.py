@@ -16,7 +16,7 @@ from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 import go1exp.mdp  # noqa: F401  (registers every term)
 from go1exp import robot
-from go1exp.config.schema import plugins
+from go1exp.config.schema import physics, plugins
 from go1exp.config.schema.physics import BACKENDS, MUJOCO_CONTACT, BackendConfig, ContactConfig, CpuBackend
 from go1exp.config.schema.registry import (
     STRICT,
@@ -56,7 +56,7 @@ class SimConfig(Strict):
         spread_starts: first episodes begin at random times, so that not all end together.
     """
 
-    physics_dt: Annotated[float, Field(ge=1e-5, le=0.02)]
+    physics_dt: physics.PhysicsStep
     policy_dt: Annotated[float, Field(gt=0, le=0.1)]
     episode_s: Duration
     spread_starts: bool
@@ -127,7 +127,7 @@ class ProcessConfig(Strict):
 
     seed: Annotated[int, Field(ge=0, le=2**32 - 1)]
     device: Annotated[str, one_of(r"auto|cpu|cuda(:\d+)?", "auto, cpu, cuda, or one of several as cuda:1")]
-    torch_threads: Annotated[int, Field(ge=0, le=1024)]
+    torch_threads: physics.Threads
     resume: FolderName | None
     start_from: FolderName | None = None  # runs of older versions have none of these keys
     sweep: FolderName | None = None

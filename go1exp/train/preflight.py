@@ -17,7 +17,7 @@ from go1exp.mdp.commands import AXES
 from go1exp.mdp.curricula import YAW_ARM
 from go1exp.sim.effects.rules import nested_actuators
 from go1exp.sim.env.core import Go1Core
-from go1exp.sim.env.engine import device_of, free_on, robot_bytes
+from go1exp.sim.env.engine import FLOAT_BYTES, device_of, free_on, robot_bytes
 from go1exp.sim.task import TrainConfig
 from go1exp.train import metrics
 from go1exp.train.schedule import check_measures
@@ -119,8 +119,6 @@ def check_devices(config: TrainConfig) -> None:
 SAMPLE_BYTES = 12
 """A sample of the ground: float64 as it is built, float32 in the engine."""
 
-FLOAT = 4
-
 
 def needed_bytes(config: TrainConfig) -> int:
     """Return a lower bound of the memory that a training takes on each device, B.
@@ -135,7 +133,7 @@ def needed_bytes(config: TrainConfig) -> int:
     rollout = ppo.num_envs * ppo.steps
     samples = rollout // ppo.minibatches * (2 if ppo.symmetry else 1)
     outputs = samples * 2 * sum(ppo.hidden)
-    return ppo.num_envs * per_robot // devices + FLOAT * (rollout * row + outputs // devices)
+    return ppo.num_envs * per_robot // devices + FLOAT_BYTES * (rollout * row + outputs // devices)
 
 
 def check_memory(config: TrainConfig, device: torch.device) -> None:

@@ -98,14 +98,14 @@ class Schedule:
         return begun
 
     def waiting(self) -> str:
-        """Return which ramps have not reached their thresholds, and how far the metrics are; empty if none waits."""
+        """Return which ramps have not reached their thresholds, and the metrics now; empty if none waits."""
         names: dict[str, list[str]] = {}
         for key, triggers in self._triggers.items():
             if self._started[key] is None:
                 means = [sum(recent) / len(recent) if recent else math.nan for recent in self._recent[key]]
                 pairs = zip(triggers, means, strict=True)
-                names.setdefault(" and ".join(f"{t} (it is {mean:.3g})" for t, mean in pairs), []).append(key)
-        return "; ".join(f"{', '.join(keys)} wait for {condition}" for condition, keys in names.items())
+                names.setdefault(" and ".join(f"{t} (now {mean:.3g})" for t, mean in pairs), []).append(key)
+        return "; ".join(f"{', '.join(keys)} (waiting for {condition})" for condition, keys in names.items())
 
     def _apply(self, steps: int) -> None:
         """Write the values at ``steps`` into the environment, those that differ from the present ones."""

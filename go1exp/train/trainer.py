@@ -99,12 +99,12 @@ class Progress:
             left = (self._last - iteration) * elapsed / max(iteration - self._first, 1)
             print(f"iteration {iteration}/{self._last}  {text}  {duration(left)} left", file=sys.stderr, flush=True)
 
-    def say_ramps(self, iteration: int, begun: Sequence[str], waiting: str) -> None:
-        """Say which ramps of the schedule begin, and at half the training and at its end which still wait."""
+    def say_ramps(self, iteration: int, begun: Sequence[str], schedule: Schedule) -> None:
+        """Print which ramps begin; at half the training and at its end warn of those that have not begun."""
         if begun:
-            self._say(f"iteration {iteration}: the schedule begins {', '.join(begun)}")
-        if waiting and iteration in (self._last // 2, self._last):
-            self._say(f"warning: iteration {iteration} of {self._last}, and of the schedule {waiting}")
+            self._say(f"iteration {iteration}: these ramps begin: {', '.join(begun)}")
+        if iteration in (self._last // 2, self._last) and (waiting := schedule.waiting()):
+            self._say(f"warning: iteration {iteration}/{self._last}: these ramps have not begun: {waiting}")
 
     def _say(self, text: str) -> None:
         if self._bar:
@@ -302,7 +302,7 @@ class _Closing:
         begun = ppo.schedule.advance(ppo.num_timesteps, ppo.group.agreed(measures) if ppo.schedule.measures else {})
         last = ppo.iteration >= self.config.ppo.iterations
         if self.progress:
-            self.progress.say_ramps(ppo.iteration, begun, ppo.schedule.waiting())
+            self.progress.say_ramps(ppo.iteration, begun, ppo.schedule)
         reason = ppo.group.agreed(self.stop.reason(ppo.iteration, logged) if self.stop and not last else "")
         stopping = ppo.group.agreed(self.asked_to_stop())
         if last or stopping or reason or ppo.iteration % self.config.checkpoint.every == 0:

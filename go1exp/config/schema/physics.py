@@ -16,6 +16,9 @@ Threads = Annotated[int, Field(ge=0, le=1024)]
 PhysicsStep = Annotated[float, Field(ge=1e-5, le=0.02)]
 """A physics step, s."""
 
+RecordedStep = Annotated[float, Field(ge=1e-5, le=0.002)]
+"""A physics step of a robot that is recorded, s."""
+
 
 class Engine(Strict):
     """What the settings of every engine tell."""

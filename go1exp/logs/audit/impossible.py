@@ -12,16 +12,16 @@ import go1exp.logs.audit.signals as signals
 from go1exp.logs.audit.excursions import excursions
 from go1exp.logs.audit.report import Finding
 from go1exp.logs.audit.signals import finding
-from go1exp.logs.audit.wraps import Turns, wrapped_angle, wrapped_speed
+from go1exp.logs.audit.wraps import wrapped_angle, wrapped_speed
 from go1exp.logs.recording import VECTORS, Recording, joint_channel, joint_channels
 from go1exp.robot import JOINTS, VELOCITY_LIMIT
 
 SHOWN = 5  # rows that a message lists
 ZEROS = "are zeros between values far from zero"  # what is wrong with rows that a logger filled
 
-LEAVE = "leave the targets before and after for a row, and nothing answers"
+LEAVE = "depart from the targets before and after for one row, and no measurement responds"
 
-WRAPS = "are off by turns of a counter that wraps, as it jumps by its full range of {:.3g} {}: unwrap them"
+WRAPS = "are off by whole turns of a counter that wraps at its range of {:.3g} {}: unwrap them"
 
 SPIKES = "are spikes that the readings before and after rule out"
 
@@ -41,10 +41,10 @@ class Impossible:
 def impossible(recording: Recording) -> Impossible:
     """Find samples that no motion explains, in a recording whose clock increases and whose values are finite."""
     rows, findings = np.zeros(len(recording.t), dtype=bool), []
-    wraps: list[Wrong] = []
-    if len(rows) >= limits.ENOUGH:
-        recording = _unwrapped(recording, wraps)
-    for channel, wrong, what in (*wraps, *_wrong(recording)) if len(rows) >= limits.ENOUGH else ():
+    if len(rows) < limits.ENOUGH:
+        return Impossible(rows, (), recording)
+    recording, wraps = _unwrapped(recording)
+    for channel, wrong, what in (*wraps, *_wrong(recording)):
         if wrong.any():
             rows |= wrong
             share, which = float(wrong.mean()), np.flatnonzero(wrong)
@@ -92,27 +92,24 @@ def _wrong(recording: Recording) -> Iterator[Wrong]:
             yield from _wrong_readings(t, VECTORS[quantity], values, ~zeros)
 
 
-def _unwrapped(recording: Recording, wraps: list[Wrong]) -> Recording:
-    """Return a recording whose angles and speeds do not wrap, and append which rows did."""
-    t, joints = recording.t, recording.meta.joints
-    if not recording.has("q"):
-        return recording
-
-    def add(name: str, turns: Turns | None, unit: str) -> np.ndarray:
-        if turns is not None:
-            wraps.append((name, turns[0] != 0.0, WRAPS.format(turns[1], unit)))
-            y = recording.channels[name] + turns[0] * turns[1]
-            target = recording.channels.get(name.replace("q_", "q_target_", 1), y)  # says which turn is none
-            changed[name] = y + turns[1] * np.round(np.median(target - y) / turns[1])
-        return changed.get(name, recording.channels[name])
-
-    changed: dict[str, np.ndarray] = {}
-    for k, joint in enumerate(joints):
-        name, speed = joint_channel("q", joint), joint_channel("qd", joint)
-        q = add(name, wrapped_angle(t, recording.channels[name], _fastest(recording, k)), "rad")
-        if speed in recording.channels:
-            add(speed, wrapped_speed(recording.channels[speed], np.gradient(q, t)), "rad/s")
-    return Recording(recording.meta, recording.channels | changed) if changed else recording
+def _unwrapped(recording: Recording) -> tuple[Recording, list[Wrong]]:
+    """Return a recording whose angles and speeds do not wrap, and which rows did."""
+    t, channels, wraps = recording.t, dict(recording.channels), list[Wrong]()
+    for k, joint in enumerate(recording.meta.joints if recording.has("q") else ()):
+        name, speed, target = (joint_channel(quantity, joint) for quantity in ("q", "qd", "q_target"))
+        q = channels[name]
+        if angle := wrapped_angle(t, q, _fastest(recording, k)):
+            turns, span = angle
+            wraps.append((name, turns != 0.0, WRAPS.format(span, "rad")))
+            q = q + turns * span
+            if target in channels:  # says which turn is none
+                q = q + span * np.round(np.median(channels[target] - q) / span)
+            channels[name] = q
+        if speed in channels and (rate := wrapped_speed(channels[speed], np.gradient(q, t))):
+            turns, span = rate
+            wraps.append((speed, turns != 0.0, WRAPS.format(span, "rad/s")))
+            channels[speed] = channels[speed] + turns * span
+    return Recording(recording.meta, channels) if wraps else recording, wraps
 
 
 def _wrong_angles(recording: Recording, q: np.ndarray) -> Iterator[Wrong]:
