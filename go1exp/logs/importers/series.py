@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from go1exp.logs.audit.limits import REVERSED
-
 HOLE = 1.5  # step, in median ones, from which a message is missing (chosen: between one step and two)
 NEAR = 3.0  # departures of a series from its own neighbours, by which another series of the same robot may depart
+REVERSED = 12.0  # rad/s; no joint turns out and back so fast within one reading (as in the audit, which loads SciPy)
 BACK = 0.2  # share of a jump that may be left after the way back (chosen)
 TURNS = 0.05  # share of the readings that must jump back before they are of several robots (chosen; fewer are spikes)
 
