@@ -56,9 +56,9 @@ docs: setup ## build the documentation in build/docs; any warning or dead link i
 	@$(BIN)/python -m sphinx -q -b html -n -W --keep-going -d build/doctrees docs build/docs
 	@echo "docs: build/docs/index.html"
 
-demo: setup ## train for five minutes, evaluate the policy, render a video, find a model error, all in runs/demo
-	@echo "demo 1/4: go1exp train experiment=five_minutes (five minutes on two cores)"
-	@$(BIN)/go1exp train experiment=five_minutes hydra.run.dir=runs/demo
+demo: setup ## train for two minutes, evaluate the policy, render a video, find a model error, all in runs/demo
+	@echo "demo 1/4: go1exp train experiment=minute (two minutes on two cores)"
+	@$(BIN)/go1exp train experiment=minute hydra.run.dir=runs/demo
 	@echo "demo 2/4: go1exp eval, at a finer physics step than in training (a quarter of a minute)"
 	@$(BIN)/go1exp eval run=runs/demo 'grid.x=[0.5,-0.5]' 'grid.y=[0.3]' 'grid.yaw=[0.8]' seconds=10 physics_dt=0.002 noise=true
 	@echo "demo 3/4: go1exp play (half a minute)"

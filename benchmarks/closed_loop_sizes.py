@@ -75,7 +75,7 @@ SIZES = {
     ),
     "small": Size(
         robots=("friction", "late"),  # those that stand take minutes more
-        task=("experiment=five_minutes",),
+        task=("experiment=minute", "ppo.num_envs=768", "ppo.iterations=160", "ppo.schedule=fixed"),
         first=(),
         walker=("sim.physics_dt=0.005", "ppo.iterations=30"),
         tuned=("sim.physics_dt=0.005", "ppo.iterations=25"),
@@ -92,7 +92,7 @@ SIZES = {
     ),
     "tiny": Size(  # for a test: nothing is learnt in it
         robots=("friction",),
-        task=("experiment=five_minutes", "ppo.num_envs=32", "ppo.iterations=1"),
+        task=("experiment=minute", "ppo.num_envs=32", "ppo.iterations=1"),
         first=(),
         walker=("sim.physics_dt=0.005",),
         tuned=("sim.physics_dt=0.005",),

@@ -30,7 +30,7 @@ ONE_AT_A_TIME = {
         "hydra.launcher.poll_s=1",
     ),
 }
-TASK = ("experiment=five_minutes", "ppo.iterations=6", "logger.tensorboard=false", "torch_threads=0")
+TASK = ("experiment=minute", "ppo.iterations=6", "logger.tensorboard=false", "torch_threads=0")
 
 
 def train(*arguments: str) -> None:

@@ -2,7 +2,7 @@
 
     python benchmarks/paper_loop.py run=RUN [out=DIR] [seconds=15]
 
-RUN is a run folder trained with ideal drives (``go1exp train experiment=five_minutes``). Prints the
+RUN is a run folder trained with ideal drives (``go1exp train experiment=minute``). Prints the
 RMSE of the joint angles of a suspended robot against those with the hidden actuator, under the same targets in closed
 loop, for ideal PD actuators and for the net.
 """

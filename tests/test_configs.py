@@ -75,7 +75,7 @@ ABLATIONS = [
 NEEDS = {"curriculum=terrain_level": ["terrain=rough"]}
 
 
-ELSEWHERE = ("experiment=ablation/", "experiment=five_minutes_part/", "effect=")
+ELSEWHERE = ("experiment=ablation/", "experiment=minute_part/", "effect=")
 """Choices with tests of their own: below, and in tests/contracts/test_effects.py."""
 
 
@@ -195,10 +195,10 @@ def test_an_ablation_works_on_the_papers_setting() -> None:
 
 def test_a_part_of_a_study_changes_what_its_file_says_and_nothing_else() -> None:
     """Each value that the part names is in force, whatever the experiment sets."""
-    swept = OmegaConf.load(CONF / "study/walking_cpu.yaml").hydra.sweeper.params["+experiment/five_minutes_part"]
-    parts = {file.stem for file in (CONF / "experiment/five_minutes_part").glob("*.yaml")}
+    swept = OmegaConf.load(CONF / "study/walking_cpu.yaml").hydra.sweeper.params["+experiment/minute_part"]
+    parts = {file.stem for file in (CONF / "experiment/minute_part").glob("*.yaml")}
     assert parts == set(swept.split(","))
-    studies = {"five_minutes": ("five_minutes_part", parts), "study": ("ablation", {"none", *DEPARTURES_OF_THE_STUDY})}
+    studies = {"minute": ("minute_part", parts), "study": ("ablation", {"none", *DEPARTURES_OF_THE_STUDY})}
     for study, (folder, names) in studies.items():
         base = flat(compose("train", [f"experiment={study}"]))
         for name in names:
@@ -252,7 +252,7 @@ def test_a_training_takes_its_own_physics_step_and_an_evaluation_that_of_the_tas
 
     assert steps() == (0.004, 0.002)
     assert steps("ppo.coarse_physics=1") == steps("ppo=warp") == (0.002, 0.002)
-    assert steps("experiment=five_minutes") == (0.01, 0.01)
+    assert steps("experiment=minute") == (0.01, 0.01)
     assert steps("sim.policy_dt=0.01") == (pytest.approx(0.01 / 3), 0.002)
     assert steps("sim.physics_dt=0.001") == (0.002, 0.001)
     assert steps("actuator=net_simulated", "actuator.period=exact") == (0.002, 0.002)  # a history of its own spacing

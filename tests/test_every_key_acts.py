@@ -121,7 +121,7 @@ NEEDS = {
     **{
         f"experiment/{name}": ["schedule=none"]  # which sets these rows
         for name in (
-            *("ablation/no_action_smoothness", "ablation/no_smoothness", "five_minutes_part/no_smoothness"),
+            *("ablation/no_action_smoothness", "ablation/no_smoothness", "minute_part/no_smoothness"),
             *("ablation/no_raised_weight", "ablation/no_diagonal_load", "ablation/no_touchdown_speed"),
         )
     },
@@ -132,13 +132,13 @@ NEEDS = {
         *("observation=clock", "reward=clock", "ppo=warp", "command=widening", "actuator=delay"),
         "observation.gait_clock.rate=3.1",  # neither the file's nor the experiment's, which the rewards take over
     ],
-    "experiment/five_minutes": ["reward=clock"],
+    "experiment/minute": ["reward=clock"],
     "actuator/delay": ["schedule=none"],  # which begins without latency
     "command/widening": ["schedule=none"],  # which begins without slow commands
     **{f"contact/{name}": ["schedule=none"] for name in ("elliptic", "soft", "stiff")},  # it begins on soft ground
     "experiment/ablation/no_latency": ["actuator=delay"],
-    **{f"experiment/{part}/no_mirrored_samples": ["ppo=small"] for part in ("ablation", "five_minutes_part")},
-    "experiment/five_minutes_part/no_near_kernels": ["experiment=five_minutes"],
+    **{f"experiment/{part}/no_mirrored_samples": ["ppo=small"] for part in ("ablation", "minute_part")},
+    "experiment/minute_part/no_near_kernels": ["experiment=minute"],
     "experiment/study": ["backend=cpu", "ppo=warp"],
     "experiment/robust": ["experiment=clock", "backend=cpu"],
     "experiment/robust_history": ["experiment=robust", "backend=cpu"],

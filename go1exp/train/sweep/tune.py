@@ -37,7 +37,7 @@ class TuneSettings:
     Attributes:
         space: what to draw from, such as ["ppo.gamma=interval(0.97,0.995)"]; also tag(log,interval(..)), range(..),
             choice(..).
-        overrides: settings of every trial, such as ["experiment=five_minutes"].
+        overrides: settings of every trial, such as ["experiment=minute"].
         trials: trainings of the whole search, those of earlier commands and of other machines counted.
         workers: trainings at once on this machine, its cores shared out.
         metric: column of metrics.csv that says how good a training is, or eval/score and others of eval.every.
