@@ -25,6 +25,7 @@ from go1exp.evaluate.protocol.pages import (
     page,
 )
 from go1exp.evaluate.protocol.playing import Result, summarised
+from go1exp.evaluate.statistics.intervals import ConditionSummary, Estimate
 from tests.phone import PHONE, needs_chromium, on_a_phone
 
 
@@ -118,11 +119,13 @@ def test_the_head_says_the_verdicts() -> None:
 def test_units_are_those_of_the_ground() -> None:
     """Where half pass is an angle on slopes and a height on gravel."""
     (one,), _ = chosen(compose("eval", ["protocol=terrain"])["protocol"])
-    half = {
+    half: dict[str, Estimate] = {
         "slope_up": {"estimate": 20.0, "low": 18.0, "high": 22.0, "n": 4, "unit": "deg"},
         "gravel": {"estimate": 0.05, "low": 0.04, "high": 0.06, "n": 4, "unit": "m"},
     }
-    summary = [{"condition": {"ground": g, "speed": 1.0}, "figures": {"at_half": f}} for g, f in half.items()]
+    summary: list[ConditionSummary] = [
+        {"condition": {"ground": g, "speed": 1.0}, "n": 4, "figures": {"at_half": f}} for g, f in half.items()
+    ]
     verdicts = evaluated(one.protocol.claims, summary)
     result = Result(one, "clock", {}, Played([]), 0, summary, verdicts, 1.0)
     claims = {row[0]: row for row in claims_table(result, meanings(result)).rows}

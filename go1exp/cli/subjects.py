@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from go1exp.cli.places import checkpoint_file, run_folder, shipped_policies, trained
 from go1exp.config.choices import choice_files, config_folder, load
@@ -18,7 +18,7 @@ from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
 if TYPE_CHECKING:
     from go1exp.config.schema.physics import BackendConfig
     from go1exp.evaluate.agents import Agent
-    from go1exp.evaluate.controller.types import Controller
+    from go1exp.evaluate.controller.types import Controller, TrunkVelocity
     from go1exp.sim.task import TaskConfig
 
 
@@ -150,7 +150,7 @@ def _bundle(bundle: str, file: str) -> Named:
     return Named(path.stem, Path(f"{path.stem}_{file}"), bundle=path)
 
 
-VELOCITIES: dict[str, Literal["exact", "estimated"]] = {"exact": "exact", "estimated": "estimated"}
+VELOCITIES: dict[str, TrunkVelocity] = {"exact": "exact", "estimated": "estimated"}
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ class Variation:
 
     policy_dt: float | None = None  # period of the policy, s; None keeps it
     engine: BackendConfig | None = None  # physics engine; None is MuJoCo
-    trunk_velocity: Literal["exact", "estimated"] | None = None  # what the policy sees of it; None keeps it
+    trunk_velocity: TrunkVelocity | None = None  # what the policy sees of it; None keeps it
 
 
 def varied(given: str, file: str) -> tuple[Named, Variation]:

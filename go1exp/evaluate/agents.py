@@ -166,10 +166,10 @@ class _RunningPolicy:
         self._earlier = self._frames.after(observation[:, history.carried], observation[:, history.earlier])
         return action
 
-    def save(self) -> Any | None:
+    def save(self) -> tuple[Past[Tensor], Past[Tensor], Tensor | None, Tensor | None] | None:
         return None if self._filter else copy.deepcopy((self._actions, self._frames, self._previous, self._earlier))
 
-    def load(self, state: Any) -> None:
+    def load(self, state: tuple[Past[Tensor], Past[Tensor], Tensor | None, Tensor | None]) -> None:
         self._actions, self._frames, self._previous, self._earlier = copy.deepcopy(state)
 
 
@@ -210,10 +210,10 @@ class _RunningBundle:
             now["base_lin_vel_b"] = self._filter.velocities().astype(np.float32)
         return torch.from_numpy(self._memory(self._bundle.policy, now)["action"])
 
-    def save(self) -> Any | None:
+    def save(self) -> tuple[PolicyMemory, np.random.Generator] | None:
         return None if self._filter else copy.deepcopy((self._memory, self._rng))
 
-    def load(self, state: Any) -> None:
+    def load(self, state: tuple[PolicyMemory, np.random.Generator]) -> None:
         self._memory, self._rng = copy.deepcopy(state)
 
 

@@ -18,6 +18,7 @@ from typing import Any
 import torch
 
 from go1exp.config.schema.physics import CpuBackend
+from go1exp.evaluate.quantities import Row
 from go1exp.evaluate.rollout import EvalConfig, evaluate, evaluation_task, grid
 from go1exp.train.policy import load_run
 
@@ -25,7 +26,7 @@ FALLEN = 1.0  # least error of a fallen robot, m/s
 NICE = 19  # lowest priority: the training comes first
 
 
-def score(rows: Sequence[dict[str, Any]], seconds: float) -> float:
+def score(rows: Sequence[Row], seconds: float) -> float:
     """Return the root mean square horizontal error, m/s; of a fallen robot its command, and at least 1 m/s."""
     squares = []
     for row in rows:

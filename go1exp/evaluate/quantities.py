@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from go1exp import robot
 from go1exp.base.files import replacing, write_json
 from go1exp.config.schema.registry import Term
-from go1exp.evaluate.statistics.intervals import Interval, mean_interval, phase_interval, rate_interval, share_interval
+from go1exp.evaluate.statistics import intervals
+from go1exp.evaluate.statistics.intervals import ConditionSummary, Estimate, Interval
 from go1exp.mdp.measures import measured, per_foot
 from go1exp.mdp.measures.trace import Trace
 
@@ -25,7 +26,9 @@ if TYPE_CHECKING:
     from go1exp.sim.env.core import Go1Core
 
 Row = dict[str, Any]
-Condition = tuple[Any, ...]
+Summary = Sequence[ConditionSummary]  # of one subject
+Summaries = Mapping[str, Summary]  # by the subject's label
+Condition = tuple[float | str, ...]  # values of the columns that identify it
 AXES = ("x", "y", "yaw")  # of a command, and its columns: m/s, m/s, rad/s
 ROBOT = "robot"  # column with the robot's number: the same number is the same robot in all conditions' draws
 FINGERPRINT = "fingerprint"  # column with a number that two robots share only if they did the same, bit for bit
@@ -58,7 +61,7 @@ class Derived:
     name: str  # of the figure
     unit: str  # of it
     meaning: str  # in words
-    condition: Mapping[str, Any]  # what it is about
+    condition: Mapping[str, float | str]  # what it is about
     better: Literal["lower", "higher"] | None  # the direction that is better
     # figure of some rows; NaN where it is not defined. Its interval is by the bootstrap over robots
     function: Callable[[Sequence[Row]], float]
@@ -69,13 +72,13 @@ def distinct(rows: Iterable[Row], keys: Sequence[str], random: bool) -> list[Row
 
     Where nothing is random all did the same, whatever the last bits of a batched matrix product say.
     """
-    first: dict[Condition, Row] = {}
+    first: dict[tuple[Condition, float | None], Row] = {}
     for row in rows:
-        first.setdefault((*(row[k] for k in keys), row[FINGERPRINT] if random else None), row)
+        first.setdefault((tuple(row[k] for k in keys), row[FINGERPRINT] if random else None), row)
     return list(first.values())
 
 
-def about(rows: Iterable[Row], condition: Mapping[str, Any]) -> list[Row]:
+def about(rows: Iterable[Row], condition: Mapping[str, float | str]) -> list[Row]:
     """Return the rows of which a condition is true."""
     return [row for row in rows if all(row.get(k) == v for k, v in condition.items())]
 
@@ -98,27 +101,27 @@ def figure(rows: Sequence[Row], column: Column) -> Interval:
     each = values(rows, column.name)
     if column.how == "share":
         known = each[np.isfinite(each)]
-        return share_interval(int(known.sum()), len(known))
-    return (phase_interval if column.how == "phase" else mean_interval)(each)
+        return intervals.share_interval(int(known.sum()), len(known))
+    return (intervals.phase_interval if column.how == "phase" else intervals.mean_interval)(each)
 
 
-def summary(rows: Sequence[Row], keys: Sequence[str], columns: Sequence[Column]) -> list[dict[str, Any]]:
+def summary(rows: Sequence[Row], keys: Sequence[str], columns: Sequence[Column]) -> list[ConditionSummary]:
     """Return an entry of plain data for each condition: its robots, and every figure with interval and n."""
-    entries = []
+    entries: list[ConditionSummary] = []
     for condition, those in by_condition(rows, keys).items():
         figures = {c.name: plain(figure(those, c), c.unit) for c in columns if any(c.name in row for row in those)}
         if FELL.name in figures and MOVING.name in figures:
             fell, moving_s = (float(np.nansum(values(those, column.name))) for column in (FELL, MOVING))
-            figures["falls_per_minute"] = plain(rate_interval(int(fell), moving_s / 60.0), "1/min")
+            figures["falls_per_minute"] = plain(intervals.rate_interval(int(fell), moving_s / 60.0), "1/min")
         entries.append({"condition": dict(zip(keys, condition, strict=True)), "n": len(those), "figures": figures})
     return entries
 
 
-def plain(interval: Interval, unit: str) -> dict[str, Any]:
-    """Return an interval for JSON, None where it is not defined."""
-    numbers = {"estimate": interval.estimate, "low": interval.low, "high": interval.high}
-    rounded = {k: float(f"{v:.{DIGITS}g}") if math.isfinite(v) else None for k, v in numbers.items()}
-    return {**rounded, "n": interval.n, "unit": unit}
+def plain(interval: Interval, unit: str) -> Estimate:
+    """Return an interval for JSON."""
+    numbers = (interval.estimate, interval.low, interval.high)
+    estimate, low, high = (float(f"{v:.{DIGITS}g}") if math.isfinite(v) else None for v in numbers)
+    return {"estimate": estimate, "low": low, "high": high, "n": interval.n, "unit": unit}
 
 
 BETTER: dict[str, Literal["lower", "higher"]] = {
@@ -144,7 +147,7 @@ def columns_of(terms: Sequence[Term]) -> list[Column]:
     return entries_so_far
 
 
-def add_measures(rows: Sequence[Row], measures: Mapping[str, Any]) -> None:
+def add_measures(rows: Sequence[Row], measures: Mapping[str, np.ndarray | None]) -> None:
     """Write the measures, (N,) or (N, 4) each by name, None if not measured, into the rows of the N robots."""
     for name, each in measures.items():
         if each is None or each.dtype.kind == "U":
@@ -164,7 +167,7 @@ def described(terms: Sequence[Term], trace: Trace) -> dict[str, Any]:
     report: dict[str, Any] = {}
     by_name = measured(trace, list(terms))
     for term in terms:
-        mean = phase_interval if term.entry.traits.get("circular") else mean_interval
+        mean = intervals.phase_interval if term.entry.traits.get("circular") else intervals.mean_interval
         each = by_name[term.key]
         if each is None:
             report[term.key] = None
@@ -178,14 +181,14 @@ def described(terms: Sequence[Term], trace: Trace) -> dict[str, Any]:
     return report
 
 
-def share(count: int, n: int) -> dict[str, Any]:
+def share(count: int, n: int) -> dict[str, float | None]:
     """Return a share of robots with Wilson's 95 % interval as plain data."""
-    return _named(share_interval(count, n), "share")
+    return _named(intervals.share_interval(count, n), "share")
 
 
-def _named(interval: Interval, name: str) -> dict[str, Any]:
+def _named(interval: Interval, name: str) -> dict[str, float | None]:
     figure = plain(interval, "")
-    return {name: figure["estimate"], **{key: figure[key] for key in ("low", "high", "n")}}
+    return {name: figure["estimate"], "low": figure["low"], "high": figure["high"], "n": figure["n"]}
 
 
 DRAW = "draw."  # first part of the name of a column with something that was drawn for the robot
@@ -213,8 +216,8 @@ def rows_of(
     fell: NDArray[np.bool_],
     moving_s: NDArray[np.float64],
     draws: Mapping[str, NDArray[np.float64]],
-    measures: Mapping[str, Any],
-) -> list[dict[str, Any]]:
+    measures: Mapping[str, np.ndarray | None],
+) -> list[Row]:
     """Return a row of plain data for each of N robots, of which ``episodes`` neighbours have one command.
 
     They are numbered as those of other commands are. ``errors`` are root mean squares, NaN where there is none;
@@ -223,7 +226,7 @@ def rows_of(
     """
     planar = np.hypot(errors[:, 0], errors[:, 1])
     figures = np.column_stack([planar, errors])
-    rows: list[dict[str, Any]] = [
+    rows: list[Row] = [
         {
             **dict(zip(AXES, map(float, commands[i]), strict=True)),
             ROBOT: i % episodes,

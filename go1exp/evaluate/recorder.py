@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -93,7 +91,7 @@ class Recorder:
     def trace(self, robots: slice | NDArray[np.intp]) -> Trace:
         """Return what was recorded of some robots."""
         rows = slice(0, self._row)
-        columns: dict[str, Any] = {name: values[rows, robots] for name, values in self._columns.items()}
+        columns = {name: values[rows, robots] for name, values in self._columns.items()}
         return Trace(
             contact=self._contact[: self._row * self._samples, robots],
             contact_dt=self._core.task.sim.physics_dt,

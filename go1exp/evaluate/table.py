@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from go1exp.base.report.table import aligned
@@ -85,7 +85,7 @@ torque, top speed and the torque-speed line; step, tau, qd and line: 99th percen
 MEANS = "Means over n robots; the JSON has intervals and all measures."
 
 
-def _triple(values: Any) -> str:
+def _triple(values: Iterable[float]) -> str:
     return ", ".join(f"{v:+.2f}" for v in values)
 
 
@@ -114,7 +114,7 @@ def _summary(report: dict[str, Any]) -> str:
     )
 
 
-def _short(command: Any) -> str:
+def _short(command: Sequence[float]) -> str:
     return " ".join(f"{v:+.1f}" if abs(10 * v - round(10 * v)) < 1e-9 else f"{v:+.2f}" for v in command)
 
 

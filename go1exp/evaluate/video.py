@@ -13,7 +13,6 @@ from contextlib import closing, contextmanager
 from functools import cache
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import mujoco
@@ -320,7 +319,7 @@ def live(core: Go1Core, policy: Policy, env: int = 0) -> None:
 
 
 @contextmanager
-def _window(stage: Stage, on_key: Callable[[int], None]) -> Iterator[Any]:
+def _window(stage: Stage, on_key: Callable[[int], None]) -> Iterator[mujoco.viewer.Handle]:
     """Open MuJoCo's window on a stage and close it at the end; ``on_key`` is called with GLFW's key codes."""
     display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     if not display:  # without a display MuJoCo would wait without end

@@ -68,11 +68,11 @@ class Mpc:
         self._place, self._lag, self._heading = np.zeros(3), np.zeros(2), 0.0
         self._forces = np.zeros((robot.NUM_LEGS, 3))
 
-    def save(self) -> Any:
+    def save(self) -> dict[str, Any]:
         """Return a copy of its state."""
         return copy.deepcopy({name: value for name, value in vars(self).items() if name not in BUILT})
 
-    def load(self, state: Any) -> None:
+    def load(self, state: dict[str, Any]) -> None:
         """Restore what ``save`` returned."""
         vars(self).update(copy.deepcopy(state))
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field
 
 from go1exp.base.report.plots import Drawing
@@ -25,8 +25,9 @@ from go1exp.config.schema.registry import (
 from go1exp.config.schema.settings import parse, settings
 from go1exp.evaluate.controller.types import TrunkVelocity
 from go1exp.evaluate.protocol.claims import Claim
-from go1exp.evaluate.protocol.plan import Constant, Motion, Plan, Velocity
+from go1exp.evaluate.protocol.plan import Array, Constant, Motion, Plan, Velocity
 from go1exp.evaluate.quantities import AXES, FINGERPRINT, LIFE, Column, Derived, Row, add_measures, columns_of, finite
+from go1exp.evaluate.statistics.intervals import ConditionSummary
 from go1exp.mdp.measures import measured
 from go1exp.mdp.measures.trace import mean_over
 
@@ -132,15 +133,17 @@ class Protocol:
         """Return the approximate number of policy steps times robots."""
         return sum(stage.steps(length.seconds, length.policy_dt) * length.robots for length in self.lengths())
 
-    def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+    def drawings(self, played: Played, summary: Sequence[ConditionSummary]) -> list[Drawing]:
         """Return the figures of the report of one subject."""
         return [*self.compared({"": played}, {"": summary}), *self.details(played, summary)]
 
-    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
+    def compared(
+        self, plays: Mapping[str, Played], summaries: Mapping[str, Sequence[ConditionSummary]]
+    ) -> list[Drawing]:
         """Return the figures that compare subjects, by their labels; the label of a single one is empty."""
         return []
 
-    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+    def details(self, played: Played, summary: Sequence[ConditionSummary]) -> list[Drawing]:
         """Return the figures that show one subject only."""
         return []
 
@@ -150,7 +153,7 @@ class Protocol:
             add_measures(rows, measured(motion.trace, self.terms()))
 
 
-def repeated(name: str, values: Sequence[Any]) -> list[str]:
+def repeated(name: str, values: Sequence[object]) -> list[str]:
     """Return a message about a setting with a repeated value: its robots would be one condition."""
     twice = [v for k, v in enumerate(values) if v in values[:k]]
     return [f"{name}: has {twice[0]} twice"] if twice else []
@@ -161,7 +164,7 @@ def rounded(values: ArrayLike) -> Any:
     return finite(np.asarray(values, dtype=np.float64).round(4).tolist())
 
 
-def bands(values: NDArray[np.float64], middle: Callable[..., Any]) -> NDArray[np.float64]:
+def bands(values: Array, middle: Callable[..., Array]) -> Array:
     """Return ``middle``, 10th and 90th percentile over robots of values (T, N, ...), (3, T, ...); NaNs are ignored."""
     known = np.isfinite(values).reshape(len(values), -1).any(1)
     over = np.full((3, len(values), *values.shape[2:]), np.nan)
@@ -245,7 +248,7 @@ def by_axis(command: Sequence[float]) -> dict[str, float]:
     return dict(zip(AXES, map(float, command), strict=True))
 
 
-def command_text(condition: Mapping[str, Any]) -> str:
+def command_text(condition: Mapping[str, float]) -> str:
     """Write a command of one or more axes, such as x 0.5, yaw 1."""
     return ", ".join(f"{axis} {condition[axis]:g}" for axis in AXES if condition[axis]) or "stand"
 

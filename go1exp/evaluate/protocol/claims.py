@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from go1exp.config.schema.registry import NonNegative
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.statistics.intervals import Interval
+from go1exp.evaluate.statistics.intervals import ConditionSummary, Interval
 
 Word = Literal["met", "close", "not met", "inconclusive"]
 
@@ -47,7 +47,7 @@ class Verdict:
     word: Word  # met, close, not met or inconclusive
     claim: Claim
     figure: Interval  # figure of the worst condition with its 95 % interval
-    condition: Mapping[str, Any]
+    condition: Mapping[str, float | str]
     conditions: int  # number of conditions with the figure
 
 
@@ -72,7 +72,7 @@ def verdict(figure: Interval, claim: Claim) -> Word:
 ORDER: tuple[Word, ...] = ("not met", "inconclusive", "close", "met")  # from the worst to the best
 
 
-def evaluated(claims: Mapping[str, Claim], summary: Sequence[Mapping[str, Any]]) -> list[Verdict]:
+def evaluated(claims: Mapping[str, Claim], summary: Sequence[ConditionSummary]) -> list[Verdict]:
     """Return the verdict on each claim in its worst condition of a ``summary``; inconclusive without any condition."""
     verdicts = []
     for name, claim in claims.items():
@@ -80,8 +80,9 @@ def evaluated(claims: Mapping[str, Claim], summary: Sequence[Mapping[str, Any]])
         for entry in summary:
             figure = entry["figures"].get(claim.quantity)
             if figure is not None and all(entry["condition"].get(k) == v for k, v in claim.where.items()):
-                known = {k: math.nan if figure[k] is None else float(figure[k]) for k in ("estimate", "low", "high")}
-                interval = Interval(known["estimate"], known["low"], known["high"], figure["n"])
+                known = (figure["estimate"], figure["low"], figure["high"])
+                estimate, low, high = (math.nan if v is None else v for v in known)
+                interval = Interval(estimate, low, high, figure["n"])
                 candidates.append(Verdict(name, verdict(interval, claim), claim, interval, entry["condition"], 0))
         nothing = Verdict(name, "inconclusive", claim, Interval(math.nan, math.nan, math.nan, 0), claim.where, 0)
         worst = min(candidates, key=_rank, default=nothing)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,7 +26,7 @@ class Difference:
     subject: str
     figure: str  # its name
     unit: str
-    condition: dict[str, Any]
+    condition: Mapping[str, float | str]
     first: float  # figure of the first subject over the pairs
     other: float  # figure of the other subject
     difference: Interval  # other - first with its interval; n is the number of pairs
@@ -62,7 +62,7 @@ def _pairs(first: Sequence[Row], other: Sequence[Row]) -> tuple[list[Row], list[
 
 
 def _difference(
-    subject: str, column: Column, condition: dict[str, Any], first: Sequence[Row], other: Sequence[Row]
+    subject: str, column: Column, condition: Mapping[str, float | str], first: Sequence[Row], other: Sequence[Row]
 ) -> Difference:
     a, b = values(first, column.name), values(other, column.name)
     both = np.isfinite(a) & np.isfinite(b)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ RESOLUTION = 0.05  # pitch of the samples, m: that of the gravel
 TREAD = 0.31  # depth of a stair, m (legged_gym)
 WAVE_LENGTH = 1.0  # m
 BOX = 0.45  # edge of a box, m (Isaac Lab)
-Field = NDArray[Any]
+Field = NDArray[np.floating]
 
 
 def _slope(x: Field, y: Field, difficulty: float, rng: np.random.Generator) -> Field:

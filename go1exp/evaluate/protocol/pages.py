@@ -19,9 +19,9 @@ from go1exp.evaluate.protocol.comparing import Difference
 from go1exp.evaluate.protocol.ground import UNITS
 from go1exp.evaluate.protocol.playing import Result, as_json
 from go1exp.evaluate.quantities import ROBOT, finite, write_rows
+from go1exp.evaluate.statistics.intervals import ConditionSummary, Estimate
 from go1exp.evaluate.statistics.runs import ORDER as COMPARED
 
-Entry = Mapping[str, Any]
 Meanings = Mapping[str, str]
 ACROSS = 5  # most columns of quantities in a table, so that it fits on paper
 MANY = 8  # largest number of conditions that are columns; more are rows
@@ -48,14 +48,14 @@ VERDICTS = (
 )
 
 
-def condition_text(condition: Mapping[str, Any]) -> str:
+def condition_text(condition: Mapping[str, float | str]) -> str:
     """Return a condition as text; of a command, the axes that are not zero."""
     moving = any(condition.get(axis) for axis in COMMAND)
     shown = {k: v for k, v in condition.items() if v or k not in COMMAND or not moving}
     return ", ".join(_value(k, v, condition) for k, v in shown.items()) or "all"
 
 
-def _value(key: str, value: Any, condition: Mapping[str, Any]) -> str:
+def _value(key: str, value: float | str, condition: Mapping[str, float | str]) -> str:
     word, unit = KEYS.get(key, (key.replace("_", " "), ""))
     if key == "difficulty":
         unit = UNITS.get(str(condition.get("ground")), "")
@@ -100,12 +100,12 @@ def claims_table(result: Result, means: Meanings) -> Table:
     return Table("Claims", header, rows, VERDICTS if rows else "None.")
 
 
-def figure_tables(entries: Sequence[Entry], means: Meanings) -> list[Table]:
+def figure_tables(entries: Sequence[ConditionSummary], means: Meanings) -> list[Table]:
     """Return the quantities in tables, one for each set of keys of the conditions.
 
     A row is a quantity and a column a condition; with many conditions, the other way round.
     """
-    groups: dict[tuple[str, ...], list[Entry]] = {}
+    groups: dict[tuple[str, ...], list[ConditionSummary]] = {}
     for entry in _merged(entries):
         groups.setdefault(tuple(entry["condition"]), []).append(entry)
     tables = []
@@ -118,38 +118,43 @@ def figure_tables(entries: Sequence[Entry], means: Meanings) -> list[Table]:
         if len(those) <= MANY:
             tables += _split(title, "quantity", _explained(units, means), where, cells)
         else:
-            across: list[list[Any]] = [list(column) for column in zip(*cells, strict=True)]
+            across = list(zip(*cells, strict=True))
             notes = [f"{name}: {means[name]}" if name in means else "" for name in units]
             tables += _split(title, "condition", where, [named(*head) for head in units.items()], across, notes)
     return tables
 
 
-def _unit(name: str, entries: Sequence[Entry]) -> str:
+def _unit(name: str, entries: Sequence[ConditionSummary]) -> str:
     """Return the unit of a quantity in some entries; empty where units differ, as difficulties of grounds do."""
     units = {e["figures"][name]["unit"] for e in entries if name in e["figures"]}
     return units.pop() if len(units) == 1 else ""
 
 
-def _merged(entries: Sequence[Entry]) -> list[Entry]:
-    merged: dict[tuple[Any, ...], dict[str, Any]] = {}
+def _merged(entries: Sequence[ConditionSummary]) -> list[ConditionSummary]:
+    merged: dict[tuple[tuple[str, float | str], ...], ConditionSummary] = {}
     for entry in entries:
-        one = merged.setdefault(tuple(entry["condition"].items()), {"condition": entry["condition"], "figures": {}})
+        one = merged.setdefault(tuple(entry["condition"].items()), {**entry, "figures": {}})
         one["figures"] |= entry["figures"]
     return list(merged.values())
 
 
-def _names(entries: Sequence[Entry]) -> list[str]:
+def _names(entries: Sequence[ConditionSummary]) -> list[str]:
     """Return the quantities of some entries: falls first, without time in motion and without an unused ``left_map``."""
     names = dict.fromkeys(name for e in entries for name in e["figures"])
     names.pop("moving_s", None)
-    if not any(e["figures"].get("left_map", {}).get("estimate") for e in entries):
+    if not any(e["figures"]["left_map"]["estimate"] for e in entries if "left_map" in e["figures"]):
         names.pop("left_map", None)
     first = [name for name in ("fell", "falls_per_minute") if name in names]
     return [*first, *(name for name in names if name not in first)]
 
 
 def _split(
-    title: str, corner: str, rows: Sequence[Any], columns: Sequence[str], cells: Any, notes: Sequence[str] = ()
+    title: str,
+    corner: str,
+    rows: Sequence[Cell | str],
+    columns: Sequence[str],
+    cells: Sequence[Sequence[Cell | str]],
+    notes: Sequence[str] = (),
 ) -> list[Table]:
     """Return tables of at most ``ACROSS`` equally many columns beside the first, without rows that are empty."""
     wide = math.ceil(len(columns) / math.ceil(len(columns) / ACROSS))
@@ -173,7 +178,7 @@ def _explained(units: Mapping[str, str], means: Meanings) -> list[Cell]:
     return heads
 
 
-def _cell(name: str, figure: Mapping[str, Any] | None, unit: str) -> Cell | str:
+def _cell(name: str, figure: Estimate | None, unit: str) -> Cell | str:
     """Return a cell, with the unit where the head of its row or column has none."""
     if figure is None:
         return ""

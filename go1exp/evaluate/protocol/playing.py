@@ -18,7 +18,7 @@ from go1exp.evaluate.protocol.base import Chosen, Length, Played, Protocol
 from go1exp.evaluate.protocol.claims import Verdict, evaluated
 from go1exp.evaluate.protocol.stage import Rates, Setting, Stage
 from go1exp.evaluate.quantities import ROBOT, Derived, Row, about, by_condition, coarse_note, distinct, plain, summary
-from go1exp.evaluate.statistics.intervals import Interval, bootstrap_interval
+from go1exp.evaluate.statistics.intervals import ConditionSummary, Interval, bootstrap_interval
 
 
 @dataclass
@@ -30,7 +30,7 @@ class Result:
     about: dict[str, Any]  # origin of the agent, robot, seed and rates: plain data
     played: Played  # rows without repeats, curves, notes
     repeats: int  # number of rows that repeated another one and do not count
-    summary: list[dict[str, Any]]  # figures with n and interval, by condition
+    summary: list[ConditionSummary]  # figures with n and interval, by condition
     verdicts: list[Verdict]  # of its claims
     seconds: float  # what it took, s
 
@@ -98,7 +98,7 @@ def _stage(protocol: Protocol, agent: Agent, rates: Rates, on_step: Progress = l
     return Stage(agent, Setting(**vars(rates), noise=noise, randomize=randomize, trunk_velocity=velocity), on_step)
 
 
-def summarised(chosen: Chosen, rows: Sequence[Row]) -> list[dict[str, Any]]:
+def summarised(chosen: Chosen, rows: Sequence[Row]) -> list[ConditionSummary]:
     """Return every figure of a protocol's rows with n and interval: by condition, then those of all robots together."""
     protocol = chosen.protocol
     entries = summary(rows, protocol.keys, protocol.columns())

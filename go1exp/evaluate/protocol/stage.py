@@ -188,7 +188,7 @@ class Session:
         """Play the next ``steps`` steps."""
         n, plan, core = self.plan.robots, self.plan, self.core
         dt, first = core.task.sim.policy_dt, self.step
-        kept: dict[str, Any] = {name: np.zeros((steps, n)) for name in ("height", "way", "front_right")}
+        kept: dict[str, np.ndarray] = {name: np.zeros((steps, n)) for name in ("height", "way", "front_right")}
         kept |= {"velocity": np.zeros((steps, n, 3)), "alive": np.zeros((steps, n), bool)}
         kept["command"], finished = np.zeros((steps, n, 3)), np.zeros(n, bool)
         for row in range(steps):
@@ -233,7 +233,7 @@ class Session:
         self._left |= self._alive & truncated
         self._alive &= ~(terminated | truncated)
 
-    def _keep(self, kept: dict[str, Any], row: int) -> None:
+    def _keep(self, kept: dict[str, np.ndarray], row: int) -> None:
         s = self.core.snapshot()
         kept["velocity"][row] = planar_velocity(self.core).numpy()
         below = self.core.ground_height(s.base_pos_w[:, :2])

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from go1exp.config.schema.registry import ConfigError, members, unknown_name
 from go1exp.evaluate.protocol.base import Chosen, Protocol, chosen
@@ -29,7 +28,7 @@ MAIN = ("error_xy", "error_yaw", FELL.name)
 class RunRows:
     """The rows of one run."""
 
-    table: dict[str, NDArray[Any]]  # columns (n,) by name
+    table: dict[str, np.ndarray]  # columns (n,) by name
     settings: dict[str, Any]  # of the evaluation, plain data; only equal ones are compared
     keys: tuple[str, ...]  # columns with the condition and the robot of a row
     protocol: Protocol | None  # None for the grid
@@ -145,7 +144,7 @@ def _settings(name: str, about: Mapping[str, Any]) -> dict[str, Any]:
     return {key: about[key] for key in kept if key in about}
 
 
-def _table(file: Path) -> dict[str, NDArray[Any]]:
+def _table(file: Path) -> dict[str, np.ndarray]:
     """Return the columns of a file of rows; numbers as float64 with NaN where there is none."""
     import pyarrow as pa
     import pyarrow.parquet as pq

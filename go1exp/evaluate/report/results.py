@@ -23,7 +23,7 @@ from go1exp.evaluate.statistics.intervals import Interval, share_interval, strat
 from go1exp.evaluate.statistics.runs import ALPHA, ORDER, Difference, Word, holm, iqm_interval
 
 Floats = NDArray[np.float64]
-Condition = tuple[tuple[str, Any], ...]  # its columns and their values; empty for all conditions together
+Condition = tuple[tuple[str, float | str], ...]  # its columns and their values; empty for all conditions together
 Source = Literal["setting", "drawn"]  # a swept setting (over runs), or a randomised quantity (over robots)
 Rows = Mapping[Path, NDArray[np.bool_]]  # selected rows of each run
 
@@ -206,7 +206,7 @@ def _of_settings(evaluation: Evaluation, made: Sequence[Group], column: Column) 
     return associations({key: _numbers_or_names(each) for key, each in swept.items()}, values)
 
 
-def _numbers_or_names(values: Sequence[Any]) -> NDArray[Any]:
+def _numbers_or_names(values: Sequence[object]) -> np.ndarray:
     numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
     return np.array(values, dtype=np.float64) if numbers else np.array([str(v) for v in values])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -234,7 +234,7 @@ def _flat(config: Mapping[str, Any], path: str = "") -> dict[str, Any]:
     return values
 
 
-def _as_text(value: Any) -> str:
+def _as_text(value: object) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
@@ -282,7 +282,7 @@ def _by_keys(group: Group, usual: Mapping[str, str], count: int) -> str:
     return ", ".join(parts) or "as most"
 
 
-def _missing(key: str, known: Mapping[str, Any]) -> str:
+def _missing(key: str, known: Collection[str]) -> str:
     """Return the longest part of a key's path that a configuration does not have: a term, rather than each setting."""
     parts = key.split(".")
     paths = [".".join(parts[:length]) for length in range(1, len(parts) + 1)]

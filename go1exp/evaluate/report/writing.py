@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import cycle
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from go1exp.base.report.plots import COLOURS, WIDE, Drawing, band, legend, listi
 from go1exp.base.wording import counted
 from go1exp.evaluate.protocol.pages import by_word, named
 from go1exp.evaluate.quantities import finite
-from go1exp.evaluate.report.curves import AXES, Curve
+from go1exp.evaluate.report.curves import AXES, Curve, Floats
 from go1exp.evaluate.report.results import Figure, Report, Sensitivity
 from go1exp.evaluate.report.tables import SOURCES, PlainRow, about_baseline, plain_rows, tables
 
@@ -71,7 +70,7 @@ def csv_text(rows: Sequence[PlainRow]) -> str:
     return text.getvalue()
 
 
-def _cell(value: Any) -> Any:
+def _cell(value: object) -> object:
     if isinstance(value, float):
         return f"{value:.6g}" if math.isfinite(value) else ""
     return value
@@ -152,7 +151,7 @@ def _learning(curves: Sequence[Curve], baseline: str, of_groups: Looks) -> plots
     return figure
 
 
-def _limits(middles: Sequence[Any], bounds: Sequence[Any]) -> tuple[float, float]:
+def _limits(middles: Sequence[Floats], bounds: Sequence[Floats]) -> tuple[float, float]:
     """Return limits of the y axis that are filled by the means: bands of two or three runs are far wider."""
     means, every = np.concatenate(middles), np.concatenate([*middles, *bounds])
     low, high = float(means.min()), float(means.max())

@@ -76,7 +76,7 @@ def associations(quantities: Mapping[str, ArrayLike], figure: ArrayLike) -> list
     """
     y = np.asarray(figure, dtype=np.float64)
     kept = np.isfinite(y)
-    columns: dict[str, NDArray[Any]] = {name: np.asarray(values) for name, values in quantities.items()}
+    columns = {name: np.asarray(values) for name, values in quantities.items()}
     for values in columns.values():
         if values.dtype.kind in "fiub":
             kept &= np.isfinite(values.astype(np.float64))
@@ -93,7 +93,7 @@ def associations(quantities: Mapping[str, ArrayLike], figure: ArrayLike) -> list
     return sorted(entries, key=lambda e: -e.importance if math.isfinite(e.importance) else math.inf)
 
 
-def permutation_importance(columns: Mapping[str, NDArray[Any]], y: NDArray[np.float64]) -> dict[str, float]:
+def permutation_importance(columns: Mapping[str, np.ndarray], y: NDArray[np.float64]) -> dict[str, float]:
     """Return the share of y's rank variance that each quantity explains; NaN with few rows.
 
     Each row is predicted from the other folds; shuffling a quantity raises the mean square error by twice its
@@ -130,7 +130,7 @@ def permutation_importance(columns: Mapping[str, NDArray[Any]], y: NDArray[np.fl
     return importance
 
 
-def _features(values: NDArray[Any]) -> NDArray[np.float64]:
+def _features(values: np.ndarray) -> NDArray[np.float64]:
     """Return the columns of a quantity: its ranks, or one for each category but the first."""
     if values.dtype.kind in "fiub":
         ranks = scipy.stats.rankdata(values)

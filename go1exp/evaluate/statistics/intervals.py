@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, TypedDict
 
 import numpy as np
 import scipy
@@ -22,6 +23,24 @@ class Interval:
     low: float
     high: float
     n: int
+
+
+class Estimate(TypedDict):
+    """An interval as plain data; None where it is not defined."""
+
+    estimate: float | None
+    low: float | None
+    high: float | None
+    n: int
+    unit: str
+
+
+class ConditionSummary(TypedDict):
+    """The figures of the robots of one condition, by name."""
+
+    condition: dict[str, Any]
+    n: int
+    figures: dict[str, Estimate]
 
 
 def constant(values: ArrayLike, trim: float = 0.0) -> bool:

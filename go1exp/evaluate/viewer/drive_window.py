@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
 
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.implot import implot
 
+from go1exp.evaluate.controller.types import TrunkVelocity
 from go1exp.evaluate.video import steer
 from go1exp.evaluate.viewer import requests as ask
 from go1exp.evaluate.viewer.page_server import PUSH, STAND, Gamepad, steered
@@ -32,7 +33,7 @@ AXES = ("forward m/s", "left m/s", "yaw rad/s")
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0)
 RATES = (None, 0.001, 0.002, 0.004, 0.005)  # physics steps to choose from, s; None is that of training
 MOST_BUTTONS = 6  # number of policies up to which each has a button; more are a list
-VELOCITIES = ("exact", "estimated")
+VELOCITIES: tuple[TrunkVelocity, ...] = ("exact", "estimated")
 VELOCITY_AXES = (("x", "m/s"), ("y", "m/s"), ("yaw", "rad/s"))
 SPARK = 22.0  # height of a reward's curve, pixels
 GOOD, BAD = imgui.Vec4(0.35, 0.75, 0.4, 0.9), imgui.Vec4(0.9, 0.4, 0.3, 0.9)
@@ -180,27 +181,27 @@ class DriveWindow(LiveWindow):
 
     def _conditions_panel(self, view: WalkView) -> None:
         now = ask.Conditions(view.setup.noise, view.setup.delay, view.setup.physics_dt, view.setup.trunk_velocity)
-        wanted: dict[str, Any] = {}
+        wanted = now
         changed, noise = imgui.Checkbox("sensor noise", now.noise)
         if changed:
-            wanted["noise"] = noise
+            wanted = replace(wanted, noise=noise)
         delay = self.released_slider("delay ms", 1e3 * now.delay, 60.0, "%.0f")
         if delay is not None:
-            wanted["delay"] = 1e-3 * delay
+            wanted = replace(wanted, delay=1e-3 * delay)
         imgui.SetNextItemWidth(-85.0)
         names = ["of training", *(f"{1.0 / dt:g} Hz" for dt in RATES if dt)]
         index = RATES.index(now.physics_dt) if now.physics_dt in RATES else 0
         changed, index = imgui.Combo("physics", index, names)
         imgui.SetItemTooltip(f"in force: {1.0 / view.physics_dt:g} Hz")
         if changed:
-            wanted["physics_dt"] = RATES[index]
+            wanted = replace(wanted, physics_dt=RATES[index])
         imgui.SetNextItemWidth(-85.0)
         changed, index = imgui.Combo("velocity", VELOCITIES.index(now.trunk_velocity), list(VELOCITIES))
         imgui.SetItemTooltip("of the trunk, that the policy sees")
         if changed:
-            wanted["trunk_velocity"] = VELOCITIES[index]
-        if wanted:
-            self.ask(ask.Conditions(**{**now.__dict__, **wanted}))
+            wanted = replace(wanted, trunk_velocity=VELOCITIES[index])
+        if wanted is not now:
+            self.ask(wanted)
 
     def _velocity(self, view: WalkView) -> None:
         for axis, (name, unit) in enumerate(VELOCITY_AXES):

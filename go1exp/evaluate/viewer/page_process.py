@@ -10,9 +10,9 @@ import multiprocessing
 import signal
 from collections.abc import Callable
 from multiprocessing.connection import Connection
-from typing import Any
 
 from mujoco.studio import endpoints, messages, viewer_handle
+from mujoco.studio.plugin import SimPlugin
 
 from go1exp.base.errors import Expected
 from go1exp.base.signals import ending
@@ -33,7 +33,7 @@ class Mailbox:
         self.over = False
         self.events, self.snapshots = _Events(self), _Snapshots(self)
 
-    def send(self, kind: str, load: Any = None) -> None:
+    def send(self, kind: str, load: messages.Event | list[messages.Snapshot] | None = None) -> None:
         """Send something at once; nothing where the other end has gone."""
         try:
             self._pipe.send((kind, load))
@@ -110,13 +110,13 @@ class _Snapshots(_Channel, messages.SnapshotChannel):
         return self._box.new_snapshots()
 
 
-def _ends(box: Mailbox) -> dict[str, Any]:
+def _ends(box: Mailbox) -> dict[str, _Events | _Snapshots]:
     """Return a mailbox as the four channels of an endpoint of Studio: it carries both ways."""
     ways = ("s2v", "v2s")
     return {f"{way}_events": box.events for way in ways} | {f"{way}_snapshot": box.snapshots for way in ways}
 
 
-def launch(target: Callable[[endpoints.ViewerEndpoint], None], plugins: list[Any]) -> viewer_handle.ViewerHandle:
+def launch(target: Callable[[endpoints.ViewerEndpoint], None], plugins: list[SimPlugin]) -> viewer_handle.ViewerHandle:
     """Run a viewer in a fork, and return our handle, whose use raises ``Expected`` when the page ended by an error."""
     context = multiprocessing.get_context("fork")
     ours, theirs = context.Pipe()

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from go1exp import robot
+from go1exp.gap.replay.rows import Machine
 from go1exp.gap.result import GapResult, Overlay
 from go1exp.logs.recording import JOINT_QUANTITIES, VECTORS, Recording, RecordingError
 from go1exp.robot import JOINTS
@@ -306,6 +307,6 @@ class ReplayShow:
         return ReplayView(p.number, p.time, p.running, p.speed, p.magnify, self._ghosts())
 
 
-def model_of(robot: Any) -> mujoco.MjModel:
+def model_of(robot: Machine) -> mujoco.MjModel:
     """Return the compiled model of a robot of ``go1exp gap`` on its base."""
     return robot.build(1, 0.002, (1.0, 0.0, 0.0, 0.0), 1)[0].model

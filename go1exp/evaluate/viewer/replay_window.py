@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -23,6 +22,7 @@ COLOURS: dict[str, tuple[float, float, float, float]] = {
 SPEEDS = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0)
 NAMES = {"q": "angle", "qd": "velocity", "tau_est": "torque, reported", "tau_cmd": "torque, commanded"}
 HEIGHT = 165.0  # of a plot, pixels
+Curve = tuple[str, list[float], list[float]]  # name, times in s, values
 NOW = imgui.Vec4(1.0, 1.0, 1.0, 0.6)
 
 
@@ -36,16 +36,16 @@ class ReplayWindow(Window):
         self._ghosts_shown = True
         self._scenes: list[tuple[mujoco.MjvScene, mujoco.MjData]] = []
         self._model: mujoco.MjModel | None = None
-        self._key: Any = None
-        self._lines: dict[str, Any] = {}
+        self._key: tuple[int, str] | None = None
+        self._lines: dict[str, dict[str, list[Curve]]] = {}
 
-    def sight(self) -> tuple[Any, float]:
+    def sight(self) -> tuple[np.ndarray, float]:
         """Return a place between the robots, from far enough to see all."""
         shift = max((ghost.shift for ghost in self.view.ghosts), key=lambda v: float(abs(v).sum()), default=np.zeros(3))
         self.follow = self.follow and not shift.any()
         return 0.5 * shift, 1.6 + float(np.linalg.norm(shift))
 
-    def scene(self) -> Iterable[Any]:
+    def scene(self) -> Iterable[mujoco.MjvGeom]:
         """Return the shapes of the robots beside the model's own."""
         view: ReplayView = self.view
         if not self._ghosts_shown:
@@ -53,13 +53,13 @@ class ReplayWindow(Window):
         if self._model is not self.viewer.model or len(self._scenes) != len(view.ghosts):
             self._model = self.viewer.model
             self._scenes = [(mujoco.MjvScene(self._model, 500), mujoco.MjData(self._model)) for _ in view.ghosts]
-        shapes: list[Any] = []
+        shapes: list[mujoco.MjvGeom] = []
         for ghost, (scene, data) in zip(view.ghosts, self._scenes, strict=True):
             if len(ghost.qpos) == self._model.nq:
                 shapes += self._shapes(ghost, scene, data)
         return shapes
 
-    def _shapes(self, ghost: Ghost, scene: mujoco.MjvScene, data: mujoco.MjData) -> list[Any]:
+    def _shapes(self, ghost: Ghost, scene: mujoco.MjvScene, data: mujoco.MjData) -> list[mujoco.MjvGeom]:
         assert self._model is not None
         data.qpos[:] = ghost.qpos
         mujoco.mj_kinematics(self._model, data)
@@ -163,9 +163,7 @@ class ReplayWindow(Window):
                 if lines["errors"]:
                     self._plot(f"##e{quantity}", f"error {UNITS[quantity]}", lines["errors"], view.time, piece)
 
-    def _plot(
-        self, label: str, unit: str, lines: Sequence[tuple[str, list[float], list[float]]], now: float, piece: Piece
-    ) -> None:
+    def _plot(self, label: str, unit: str, lines: Sequence[Curve], now: float, piece: Piece) -> None:
         flags = int(implot.Flags.NoMenus) | int(implot.Flags.NoTitle) | int(implot.Flags.NoMouseText)
         if not implot.BeginPlot(label, Vec2(-1.0, HEIGHT), flags):
             return
@@ -183,10 +181,10 @@ class ReplayWindow(Window):
         implot.PopStyleVar()
 
 
-def _lines(piece: Piece, joint: str) -> dict[str, Any]:
+def _lines(piece: Piece, joint: str) -> dict[str, dict[str, list[Curve]]]:
     """Return the curves of a joint by quantity, ready to be drawn: values, errors, and the noise beside errors."""
     t = thinned(piece.t - piece.t[0])
-    drawn: dict[str, Any] = {}
+    drawn = {}
     for quantity, by_joint in piece.curves.items():
         curves = by_joint[joint]
         values = [(name, t, thinned(v)) for name, v in curves.items()]
@@ -201,7 +199,7 @@ def _lines(piece: Piece, joint: str) -> dict[str, Any]:
     return drawn
 
 
-def thinned(values: Any, most: int = 1500) -> list[float]:
+def thinned(values: np.ndarray, most: int = 1500) -> list[float]:
     """Return at most about ``most`` values, evenly spaced, for a curve."""
     every = -(-len(values) // most)
     return [float(v) for v in values[::every]]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, cast, get_args
+from typing import Any, cast, get_args
 
 from go1exp import robot
 from go1exp.config.choices import choice_files, config_folder, load
@@ -13,6 +13,7 @@ from go1exp.config.schema.joint_values import JointValues, numbers
 from go1exp.config.schema.physics import BackendConfig, ContactConfig, fitting_step
 from go1exp.config.schema.registry import ConfigError, Term
 from go1exp.config.schema.settings import subset
+from go1exp.evaluate.controller.types import TrunkVelocity
 from go1exp.evaluate.protocol.ground import UNITS, GroundName, Lanes
 from go1exp.evaluate.protocol.stage import delay_of_effects
 from go1exp.evaluate.rollout import EvalConfig, delayed, evaluation_task
@@ -70,7 +71,7 @@ class Conditions:
     noise: bool = False  # add sensor noise to the observations
     delay: float = 0.0  # additional command delay, s
     physics_dt: float | None = None  # physics step, s; None takes that of training
-    trunk_velocity: Literal["exact", "estimated"] = "exact"  # the true one, or that of the Kalman filter
+    trunk_velocity: TrunkVelocity = "exact"  # the true one, or that of the Kalman filter
 
 
 @dataclass(frozen=True)
@@ -157,7 +158,7 @@ def params_of(term: Term) -> tuple[Param, ...]:
     return declared
 
 
-def _scaled(value: JointValues, param: Param, size: float) -> Any:
+def _scaled(value: JointValues, param: Param, size: float) -> JointValues:
     def one(v: float) -> float:
         return min(max(param.null + size * (v - param.null), param.low), param.high)
 

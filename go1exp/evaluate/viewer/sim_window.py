@@ -6,7 +6,7 @@ import math
 from collections import deque
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -133,7 +133,7 @@ class SimShow:
         self._fresh = False
         frame, h = self._frame, self._history
         t = h.times().tolist()
-        curves: dict[str, Any] = {name: h.series(name).T for name in WIDTHS}
+        curves = {name: h.series(name).T for name in WIDTHS}
         pushes = [p for p in self._pushes if frame.clock - p.time < SPAN]
         new = pushes and frame.clock - pushes[-1].time < PUSH_SHOWN_S
         arrows = (push_arrow(self.data.qpos[:3].copy(), pushes[-1].impulse, pushes[-1].angle),) if new else ()

@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from go1exp.evaluate.viewer import requests as ask
 from go1exp.evaluate.viewer.requests import Ground, Setup, lines
 from go1exp.evaluate.viewer.session import PUSH_SHOWN_S, Session
 from go1exp.sim.env.camera import ARROW_SCALE, COMMAND_RGB, LEAST_DRAWN, MEASURED_RGB, VELOCITY_TIME, Stage
+from go1exp.sim.env.core import Go1Core
 
 VIEWS_PER_S = 25.0  # rate at which the panels get new curves, Hz
 PAUSED_S = 0.02  # time between two calls while paused, s
@@ -86,7 +86,7 @@ class WalkShow:
     def __init__(self, session: Session) -> None:
         self.session = session
         self._effects = lines(session.robots.effects)
-        self._core: Any = None
+        self._core: Go1Core | None = None
         self._speed = np.zeros(2)
         self._clock, self._then, self._achieved = time.perf_counter(), session.time, 1.0
         self._shown = -math.inf
@@ -94,15 +94,16 @@ class WalkShow:
 
     def _place(self) -> None:
         """Set the robot's pose in the scene; a new ground is a new model."""
-        if self._core is not self.session.core:
-            old, self._core = getattr(self, "_stage", None), self.session.core
-            if old is None or old.core.terrain.config != self._core.terrain.config:
-                self._stage = Stage(self._core)
+        core = self.session.core
+        if self._core is not core:
+            old, self._core = getattr(self, "_stage", None), core
+            if old is None or old.core.terrain.config != core.terrain.config:
+                self._stage = Stage(core)
                 self.model, self.data = self._stage.model, self._stage.data
             else:
-                old.core = self._core
+                old.core = core
         if self._stage.place(0):
-            self._stage = Stage(self._core)
+            self._stage = Stage(core)
             self._stage.place(0)
             self.model, self.data = self._stage.model, self._stage.data
 

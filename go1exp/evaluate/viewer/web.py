@@ -7,6 +7,7 @@ another (``page_process``); they exchange messages (``Ask`` and ``Shown``), as S
 from __future__ import annotations
 
 import logging
+import socket
 import threading
 import time
 import urllib.error
@@ -51,7 +52,7 @@ class PictureRate:
 
 
 try:
-    from mujoco.studio import messages, plugin, viewer_handle, viewer_protocol, web_viewer
+    from mujoco.studio import endpoints, messages, plugin, viewer_handle, viewer_protocol, web_viewer
     from mujoco.studio.web import web_server
     from websockets.exceptions import ConnectionClosed
 
@@ -99,7 +100,7 @@ class Show(Protocol):
     def tick(self) -> float:
         """Advance; return the real time until the next call, s; raise ``Ended`` at the end."""
 
-    def view(self) -> Any | None:
+    def view(self) -> object:
         """Return the content of the panels; None if nothing has changed."""
 
 
@@ -134,7 +135,7 @@ _opening = threading.Lock()
 
 
 @contextmanager
-def _behind(gate: Gate, pad: Gamepad, sock: Any) -> Iterator[None]:
+def _behind(gate: Gate, pad: Gamepad, sock: socket.socket) -> Iterator[None]:
     """Let the server that is created inside use ``sock``, ``gate`` and ``pad``: Studio has no settings for them."""
     usual = web_server.serve, web_server.bind_public_socket, web_viewer._print_url_banner
     started = threading.Event()
@@ -175,12 +176,12 @@ def _not_a_browser_that_left(record: logging.LogRecord) -> bool:
 
 
 def _opened(
-    title: str, gate: Gate, pad: Gamepad, sock: Any, windows: list[plugin.ViewerPlugin], show: Show
+    title: str, gate: Gate, pad: Gamepad, sock: socket.socket, windows: list[plugin.ViewerPlugin], show: Show
 ) -> viewer_handle.ViewerHandle:
     logging.getLogger("WebServer").setLevel(logging.WARNING)
     logging.getLogger("asyncio").addFilter(_not_a_browser_that_left)
 
-    def target(endpoint: Any) -> None:
+    def target(endpoint: endpoints.ViewerEndpoint) -> None:
         with _behind(gate, pad, sock):
             viewer = _Viewer(viewer_protocol.ViewerConfig(title=title, gfx="web"), endpoint, plugins=windows)
         viewer_protocol.run_viewer_loop(viewer)

@@ -48,15 +48,15 @@ class Window(plugin.ViewerPlugin):
     def keys(self) -> None:
         """Handle keys."""
 
-    def scene(self) -> Iterable[Any]:
+    def scene(self) -> Iterable[mujoco.MjvGeom]:
         """Return shapes (``MjvGeom``) beside the model's own."""
         return ()
 
-    def sight(self) -> tuple[Any, float]:
+    def sight(self) -> tuple[np.ndarray, float]:
         """Return the camera's first target relative to the robot, m, and its distance, relative to that of a clip."""
         return np.zeros(3), 1.6
 
-    def ask(self, request: Any) -> None:
+    def ask(self, request: object) -> None:
         """Send a request of the user."""
         self.viewer.send_to_sim(Ask(request))
 
@@ -123,7 +123,7 @@ class Window(plugin.ViewerPlugin):
         self._looking = self._looking and self.follow
 
 
-def arrow_shape(arrow: Arrow) -> Any:
+def arrow_shape(arrow: Arrow) -> mujoco.MjvGeom:
     """Return an arrow as a shape of the scene."""
     geom, kind = mujoco.MjvGeom(), mujoco.mjtGeom.mjGEOM_ARROW
     rgba = np.array([*arrow.rgb, 1.0], np.float32)
@@ -174,7 +174,7 @@ class LiveWindow(Window):
         if imgui.IsKeyPressed(imgui.Key.Backspace, False):
             self.ask(ask.Reset())
 
-    def scene(self) -> Iterable[Any]:
+    def scene(self) -> Iterable[mujoco.MjvGeom]:
         """Return the arrows."""
         return [arrow_shape(arrow) for arrow in self.view.arrows]
 

@@ -14,7 +14,7 @@ from go1exp.config.schema.registry import protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import ERRORS, Played, Steady, bands, by_axis, command_text, rounded
 from go1exp.evaluate.protocol.plan import Motion
-from go1exp.evaluate.quantities import Column, Row
+from go1exp.evaluate.quantities import Column, Row, Summaries, Summary
 
 RISEN = 0.9  # share of the steady-state velocity at which a step has risen
 
@@ -53,18 +53,20 @@ class Corners(Steady):
             shares[command_text(by_axis(command))] = rounded(bands(along, np.nanmean)[0])
         return {"t": rounded(motion.t), "along": shares}
 
-    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[plots.Drawing]:
+    def compared(self, plays: Mapping[str, Played], summaries: Summaries) -> list[plots.Drawing]:
         """Draw the answers of all subjects."""
         text = "Share of each command that is reached, 95 % intervals over robots still standing; red: falls."
         return [plots.Drawing("answer", "Steady-state velocity", text, partial(_answers, summaries))]
 
-    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[plots.Drawing]:
+    def details(self, played: Played, summary: Summary) -> list[plots.Drawing]:
         """Draw the steps."""
         text = f"Mean share of the command over robots still standing, from rest at {self.rest_s:g} s."
-        return [plots.Drawing("steps", "Steps from rest", text, partial(_steps, played.curves))]
+        return [
+            plots.Drawing("steps", "Steps from rest", text, partial(_steps, played.curves["t"], played.curves["along"]))
+        ]
 
 
-def step_answer(along: NDArray[Any], step: int, settle: int, dt: float) -> Row:
+def step_answer(along: NDArray[np.float64], step: int, settle: int, dt: float) -> Row:
     """Return how a step of a command at row ``step`` was answered; the steady state begins at row ``settle``.
 
     ``along`` (T,) is the velocity along the command, as a share of it, every ``dt`` s.
@@ -78,7 +80,7 @@ def step_answer(along: NDArray[Any], step: int, settle: int, dt: float) -> Row:
     return {"answer": reached, "rise_s": rise, "overshoot": over}
 
 
-def _answers(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> plots.Figure:
+def _answers(summaries: Summaries) -> plots.Figure:
     first = next(iter(summaries.values()))
     figure, axes = plots.panels(1, height=0.35 + 0.24 * len(first) * max(1, 0.6 * len(summaries)))
     ax = axes[0, 0]
@@ -101,16 +103,15 @@ def _answers(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> plots.Figu
     return figure
 
 
-def _steps(curves: Mapping[str, Any]) -> plots.Figure:
-    names = list(curves["along"])
+def _steps(t: Sequence[float], along: Mapping[str, Sequence[float | None]]) -> plots.Figure:
     columns = 3
-    figure, axes = plots.panels(-(-len(names) // columns), columns, height=1.1, sharex=True, sharey=True)
-    for ax, name in zip(axes.flat, names, strict=False):
+    figure, axes = plots.panels(-(-len(along) // columns), columns, height=1.1, sharex=True, sharey=True)
+    for ax, (name, share) in zip(axes.flat, along.items(), strict=False):
         ax.axhline(1.0, color="#999999", lw=0.8)
-        ax.plot(curves["t"], np.array(curves["along"][name], dtype=float), color=plots.MEASURED, lw=0.9)
+        ax.plot(t, np.array(share, dtype=float), color=plots.MEASURED, lw=0.9)
         ax.set_title(name, fontsize=6.8, pad=2)
         ax.set_ylim(-0.4, 1.7)
-    for ax in axes.flat[len(names) :]:
+    for ax in axes.flat[len(along) :]:
         ax.remove()
     for ax in axes[-1]:
         ax.set_xlabel("time (s)")

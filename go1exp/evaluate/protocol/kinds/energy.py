@@ -16,7 +16,7 @@ from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import ERRORS, Played, Steady
 from go1exp.evaluate.protocol.kinds.gait import straight
 from go1exp.evaluate.protocol.plan import Motion
-from go1exp.evaluate.quantities import Column, Row, add_measures
+from go1exp.evaluate.quantities import Column, Row, Summaries, Summary, add_measures
 from go1exp.mdp.measures.trace import Trace, mean_over, percentile_over
 
 SATURATED = 0.99  # share of the peak torque from which on an actuator counts as saturated
@@ -66,12 +66,12 @@ class Energy(Steady):
             dots[kind] = np.concatenate([sample, extremes]).round(3).tolist()
         return {"scatter": dots}
 
-    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[plots.Drawing]:
+    def compared(self, plays: Mapping[str, Played], summaries: Summaries) -> list[plots.Drawing]:
         """Draw the cost of transport over speed."""
         text = "Mechanical work over weight and distance; commands straight ahead and back; 95 % intervals."
         return [plots.Drawing("cost", "Cost of transport over speed", text, partial(_cost, summaries))]
 
-    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[plots.Drawing]:
+    def details(self, played: Played, summary: Summary) -> list[plots.Drawing]:
         """Draw torque over speed."""
         text = (
             "Dots: all robots and commands, drawn at random, and the 50 largest torques."
@@ -101,7 +101,7 @@ def effort(trace: Trace) -> dict[str, NDArray[np.float64]]:
     }
 
 
-def _cost(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> plots.Figure:
+def _cost(summaries: Summaries) -> plots.Figure:
     figure, axes = plots.panels(1, height=2.3)
     ax = axes[0, 0]
     for k, (who, summary) in enumerate(summaries.items()):
@@ -115,7 +115,7 @@ def _cost(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> plots.Figure:
     return figure
 
 
-def _scatter(dots: Mapping[str, Any]) -> plots.Figure:
+def _scatter(dots: Mapping[str, Sequence[Sequence[float]]]) -> plots.Figure:
     figure, axes = plots.panels(1, 3, height=2.2)
     limits = zip(axes[0], dots.items(), robot.EFFORT_LIMIT, robot.VELOCITY_LIMIT, strict=True)
     for ax, (kind, points), peak, top in limits:

@@ -14,7 +14,7 @@ from go1exp.config.schema.registry import protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import ERRORS, Played, Steady, by_axis, command_text, rounded
 from go1exp.evaluate.protocol.plan import Motion
-from go1exp.evaluate.quantities import Column, Row
+from go1exp.evaluate.quantities import Column, ConditionSummary, Row, Summaries, Summary
 from go1exp.mdp.measures.gait import touchdown_phase
 from go1exp.mdp.measures.trace import find_runs
 
@@ -64,12 +64,12 @@ class Gait(Steady):
             feet[command_text(by_axis(command))] = {"stances": stances, "phases": rounded(phases[robots])}
         return {"feet": feet}
 
-    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[plots.Drawing]:
+    def compared(self, plays: Mapping[str, Played], summaries: Summaries) -> list[plots.Drawing]:
         """Draw the gait of all subjects over speed."""
         text = "Commands straight ahead, with 95 % intervals over robots."
         return [plots.Drawing("speed", "Gait over speed", text, partial(_over_speed, summaries))]
 
-    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[plots.Drawing]:
+    def details(self, played: Played, summary: Summary) -> list[plots.Drawing]:
         """Draw gait diagrams, and phases on the circle."""
         feet = played.curves["feet"]
         diagram = f"Bars: stance of one robot that does not fall, the last {SHOWN:g} s. Commands: m/s, rad/s."
@@ -135,7 +135,7 @@ SPEED = (
 )
 
 
-def _over_speed(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> plots.Figure:
+def _over_speed(summaries: Summaries) -> plots.Figure:
     figure, axes = plots.panels(3, 2, sharex=True)
     for k, (who, summary) in enumerate(summaries.items()):
         at, entries = straight(summary)
@@ -149,7 +149,7 @@ def _over_speed(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> plots.F
     return figure
 
 
-def straight(summary: Sequence[Mapping[str, Any]]) -> tuple[list[float], list[Mapping[str, Any]]]:
+def straight(summary: Summary) -> tuple[list[float], list[ConditionSummary]]:
     """Return the conditions whose command is straight ahead or back, by rising velocity, m/s; the velocities first."""
     ahead = [e for e in summary if "x" in e["condition"] and not any(e["condition"].get(k) for k in ("y", "yaw"))]
     ahead.sort(key=lambda e: e["condition"]["x"])

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from itertools import takewhile
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -19,7 +19,7 @@ from go1exp.evaluate.protocol.claims import evaluated
 from go1exp.evaluate.protocol.kinds.energy import POWER, effort
 from go1exp.evaluate.protocol.kinds.rate import LATEST_MS
 from go1exp.evaluate.protocol.plan import Motion, Plan
-from go1exp.evaluate.quantities import AXES, FELL, Column, Derived, Row, add_measures
+from go1exp.evaluate.quantities import AXES, FELL, Column, Derived, Row, Summary, add_measures
 from go1exp.evaluate.quantities import summary as summarised
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ class Hardware(Steady):
         text = "largest command delay up to which no robot falls"
         return [Derived("delay_margin", "ms", text, {}, "higher", _margin)]
 
-    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[plots.Drawing]:
+    def details(self, played: Played, summary: Summary) -> list[plots.Drawing]:
         """Draw each item against its limit, and falls over the delay."""
         bars = (
             "Figure of the worst command over its upper limit, 95 % interval; beyond the line the limit is not met."
@@ -103,7 +103,7 @@ def _margin(rows: Sequence[Row]) -> float:
     return float(max(held, default=0.0))
 
 
-def _items(hardware: Hardware, summary: Sequence[Mapping[str, Any]]) -> plots.Figure:
+def _items(hardware: Hardware, summary: Summary) -> plots.Figure:
     verdicts = [v for v in evaluated(hardware.claims, summary) if v.claim.at_most and np.isfinite(v.figure.estimate)]
     figure, axes = plots.panels(1, height=0.5 + 0.26 * max(len(verdicts), 1))
     ax = axes[0, 0]

@@ -14,8 +14,8 @@ from go1exp.base.report import plots
 from go1exp.config.schema.registry import NonNegative, Positive, protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, bands, lives, repeated, rounded
-from go1exp.evaluate.protocol.plan import Impulse, Impulses, Motion, Plan, Point, Signal
-from go1exp.evaluate.quantities import Column, Row
+from go1exp.evaluate.protocol.plan import Array, Impulse, Impulses, Motion, Plan, Point, Signal
+from go1exp.evaluate.quantities import Column, Row, Summaries, Summary
 
 if TYPE_CHECKING:
     from go1exp.evaluate.protocol.stage import Stage
@@ -104,7 +104,7 @@ class Kicks(Protocol):
         ]
         return [Length(self.seconds, self.robots, causes, recorded=bool(self.terms()))]
 
-    def starts(self) -> NDArray[np.float64]:
+    def starts(self) -> Array:
         """Return when each robot is kicked (N, P), s."""
         spread = self.jitter_s * np.arange(self.robots) / self.robots
         return spread[:, None] + self.first_s + self.every_s * np.arange(len(self.impulses))
@@ -148,7 +148,7 @@ class Kicks(Protocol):
         back = self.back(height, velocity, begin, rest, motion.dt)
         return {**row, "recovered": back is not None, "recovery_s": back}
 
-    def back(self, height: NDArray[Any], velocity: NDArray[Any], begin: int, rest: slice, dt: float) -> float | None:
+    def back(self, height: Array, velocity: Array, begin: int, rest: slice, dt: float) -> float | None:
         """Return the time (s) after step ``begin`` from which height (T,) and velocity (T, 2) stay near.
 
         Near their means over the steps ``rest``. None if they do not for ``recovery.hold_s``.
@@ -175,11 +175,11 @@ class Kicks(Protocol):
         speed = np.linalg.norm(motion.velocity[:, n, :2], axis=-1)
         rest = slice(round((self.first_s - BEFORE) / motion.dt), round(self.first_s / motion.dt))
         plain = {"t": motion.t, "height": motion.height[:, n], "speed": speed}
-        kept: dict[str, Any] = {k: rounded(v[alive]) for k, v in plain.items()}
+        kept = {k: rounded(v[alive]) for k, v in plain.items()}
         kicks, nominal = self.starts()[n].round(3).tolist(), float(motion.height[rest, n].mean())
         return {**kept, "kicks": kicks, "nominal": nominal, "dt": motion.dt}
 
-    def _sides(self) -> NDArray[np.float64]:
+    def _sides(self) -> Array:
         """(N,) direction of the force on each robot, from its heading counter-clockwise, rad."""
         return np.where(np.arange(self.robots) % 2, np.pi, 0.0) + np.radians(self.direction_deg)
 
@@ -200,12 +200,12 @@ class Kicks(Protocol):
             curves[name] = rounded(bands(each, np.nanmedian))
         return curves
 
-    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[plots.Drawing]:
+    def compared(self, plays: Mapping[str, Played], summaries: Summaries) -> list[plots.Drawing]:
         """Draw the success of all subjects."""
         text = "Shares of robots with Wilson's 95 % interval."
         return [plots.Drawing("success", "Success", text, partial(_success, summaries))]
 
-    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[plots.Drawing]:
+    def details(self, played: Played, summary: Summary) -> list[plots.Drawing]:
         """Draw the figure of the paper, at the rate of the policy and at 25 Hz, and the response of all robots."""
         run, around = played.curves["run"], played.curves["kicks"]
         rate, coarse = f"{1.0 / run['dt']:.0f} Hz", round(COARSE / run["dt"])
@@ -224,7 +224,7 @@ def _coarse(begin: int, end: int, dt: float) -> NDArray[np.intp]:
     return steps[(steps >= begin) & (steps < end)]
 
 
-def _smooth(values: NDArray[Any], width: float, dt: float) -> NDArray[Any]:
+def _smooth(values: Array, width: float, dt: float) -> Array:
     """Return the running mean over ``width`` s around each row; shorter at the ends."""
     count = max(1, round(width / dt))
     kernel, ones = np.ones(count), np.ones(len(values))
@@ -265,7 +265,7 @@ def _around(kicks: Sequence[Mapping[str, Any]]) -> plots.Figure:
     return figure
 
 
-def _success(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> plots.Figure:
+def _success(summaries: Summaries) -> plots.Figure:
     figure, axes = plots.panels(1, height=2.2)
     ax = axes[0, 0]
     names = (("survived", "survival rate"), ("up", "still standing"), ("recovered", "recovered"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +14,12 @@ from go1exp.base.report import plots
 from go1exp.config.schema.registry import Count, Positive, protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, lives
-from go1exp.evaluate.protocol.plan import Impulse, Impulses, Motion, Plan, Point, Signal
-from go1exp.evaluate.quantities import Column, Derived, Row, by_condition, values
+from go1exp.evaluate.protocol.plan import Array, Impulse, Impulses, Motion, Plan, Point, Signal
+from go1exp.evaluate.quantities import Column, Derived, Row, Summaries, Summary, by_condition, values
 
 if TYPE_CHECKING:
     from go1exp.evaluate.protocol.stage import Stage
 
-Array = NDArray[np.float64]
 LONGEST_STRIDE = 0.6  # time after the start in which two touchdowns of FR are looked for, twice, s
 LOOK_S = 2 * LONGEST_STRIDE  # time after settling in which the latest kick begins, s
 LEAST_SWING = 0.05  # s
@@ -135,12 +134,12 @@ class PushMap(Protocol):
         area = Derived("area", "(N s)^2", "area within the medians of all directions", {}, "higher", _area)
         return [*figures, area, Derived("weakest", "N s", "smallest median of all directions", {}, "higher", _weakest)]
 
-    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[plots.Drawing]:
+    def compared(self, plays: Mapping[str, Played], summaries: Summaries) -> list[plots.Drawing]:
         """Draw the maps of all subjects."""
         text = "Largest impulse without a fall, N s; up is forward: median with 95 % interval; dotted: 10th percentile."
         return [plots.Drawing("map", "Impulse map", text, partial(_map, summaries))]
 
-    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[plots.Drawing]:
+    def details(self, played: Played, summary: Summary) -> list[plots.Drawing]:
         """Draw the impulse over the phase of the gait."""
         text = (
             "Median over robots and directions, 10th to 90th percentile, by the phase in the stride of FR at which the"
@@ -200,7 +199,7 @@ def _weakest(rows: Sequence[Row]) -> float:
     return float(_medians(rows).min())
 
 
-def _map(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> plots.Figure:
+def _map(summaries: Summaries) -> plots.Figure:
     figure, axes = plots.panels(1, height=4.0, subplot_kw={"projection": "polar"})
     ax = axes[0, 0]
     for k, (who, summary) in enumerate(summaries.items()):
@@ -211,8 +210,10 @@ def _map(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> plots.Figure:
                 continue
             angle = np.array([a for a, _ in shown] + [shown[0][0] + 2 * np.pi])
             closed = [f for _, f in shown] + [shown[0][1]]
-            middle, low, high = (
-                [f["estimate"] if f[name] is None else f[name] for f in closed] for name in ("estimate", "low", "high")
+            middle = [f["estimate"] for f in closed]
+            low, high = (
+                [m if bound is None else bound for m, bound in zip(middle, bounds, strict=True)]
+                for bounds in ([f["low"] for f in closed], [f["high"] for f in closed])
             )
             text = {"impulse_median": "median", "impulse_p10": "10th percentile"}[name]
             ax.plot(angle, middle, style, color=plots.COLOURS[k], lw=1.4, label=f"{who} {text}".strip())

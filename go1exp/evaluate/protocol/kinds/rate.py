@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from go1exp.base.report import plots
@@ -15,7 +16,7 @@ from go1exp.config.schema.settings import settings
 from go1exp.evaluate.controller.types import TrunkVelocity
 from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, lives, repeated
 from go1exp.evaluate.protocol.plan import Motion, Plan, Signal
-from go1exp.evaluate.quantities import Column, Derived, Row, values
+from go1exp.evaluate.quantities import Column, Derived, Row, Summaries, values
 
 if TYPE_CHECKING:
     from go1exp.evaluate.protocol.stage import Stage
@@ -127,20 +128,20 @@ class Rate(Protocol):
         difference = values(slow, "rmse_xy") - values(fast, "rmse_xy")
         return float(np.nanmean(difference)) if np.isfinite(difference).any() else np.nan
 
-    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[plots.Drawing]:
+    def compared(self, plays: Mapping[str, Played], summaries: Summaries) -> list[plots.Drawing]:
         """Draw errors, falls and action rate over the rate; of several subjects at the smallest delay."""
         text = "95 % intervals over robots that did not fall; a line for each delay, of several subjects the smallest."
         return [plots.Drawing("rate", "Error, falls and effort over the rate", text, partial(_over_rate, summaries))]
 
 
-def _rms(values: Any) -> float:
+def _rms(values: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
 SHOWN = (("rmse_xy", "RMSE xy (m/s)"), ("fell", "share that fell"), ("target_rate", "target rate (rad/s)"))
 
 
-def _over_rate(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> plots.Figure:
+def _over_rate(summaries: Summaries) -> plots.Figure:
     first = [e["condition"] for e in next(iter(summaries.values())) if "rate_hz" in e["condition"]]
     velocities = list(dict.fromkeys(c["velocity"] for c in first))
     delays = sorted({c["delay_ms"] for c in first})

@@ -7,6 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import Field
 
 from go1exp.base.report import plots
@@ -14,7 +15,7 @@ from go1exp.config.schema.registry import Positive, protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import ERRORS, Cause, Length, Played, Protocol, bands, lives, repeated, rounded
 from go1exp.evaluate.protocol.plan import Motion, Plan, Sine, response
-from go1exp.evaluate.quantities import AXES, Column, Row
+from go1exp.evaluate.quantities import AXES, Column, Row, Summaries, Summary
 
 if TYPE_CHECKING:
     from go1exp.evaluate.protocol.stage import Stage
@@ -72,7 +73,7 @@ class Sinusoid(Protocol):
         listen = round(self.longest / stage.policy_dt) if self.terms() else None
         motion = stage.run(Plan(command, listen_from=listen))
         rows = lives(motion)
-        curves: dict[str, Any] = {}
+        curves = {}
         for k, sine in enumerate(self.ladder):
             robots = slice(k * self.robots, (k + 1) * self.robots)
             condition = {"amplitude": label(sine), "period": sine.period}
@@ -96,7 +97,7 @@ class Sinusoid(Protocol):
                 row |= {f"{name}_{axis}": float(v[n, a]) if up and asked else None for name, v in figures.items()}
                 row[f"rmse_{axis}"] = float(rmse[n, a]) if up else None
 
-    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[plots.Drawing]:
+    def compared(self, plays: Mapping[str, Played], summaries: Summaries) -> list[plots.Drawing]:
         """Draw gain and lag of all subjects over frequency."""
         text = (
             "Gain 1 and lag 0 are perfect. 95 % intervals over robots; one line for each amplitude: x (m/s), y (m/s),"
@@ -104,7 +105,7 @@ class Sinusoid(Protocol):
         )
         return [plots.Drawing("bode", "Gain and lag over frequency", text, partial(_bode, summaries))]
 
-    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[plots.Drawing]:
+    def details(self, played: Played, summary: Summary) -> list[plots.Drawing]:
         """Draw the rows of the paper for each sine."""
         text = (
             "Black: commanded; blue: measured, thin of one robot, thick the mean of those still standing with the 10th"
@@ -131,7 +132,7 @@ def _curve(motion: Motion, robots: slice) -> dict[str, Any]:
     return {"t": rounded(motion.t[::EVERY]), **{name: rounded(values) for name, values in named.items()}}
 
 
-def _rows(curve: Mapping[str, Any]) -> plots.Figure:
+def _rows(curve: Mapping[str, ArrayLike]) -> plots.Figure:
     figure, axes = plots.panels(3, sharex=True)
     t = curve["t"]
     mean, low, high, one, command = (
@@ -154,7 +155,7 @@ LOOKS = (("o", "-"), ("s", "--"), ("^", ":"), ("D", "-."))
 """Marker and line style of each amplitude; colours are the subjects'."""
 
 
-def _bode(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> plots.Figure:
+def _bode(summaries: Summaries) -> plots.Figure:
     figure, axes = plots.panels(3, 2, sharex=True)
     lines = [(who, a) for who, s in summaries.items() for a in dict.fromkeys(e["condition"]["amplitude"] for e in s)]
     amplitudes = list(dict.fromkeys(amplitude for _, amplitude in lines))

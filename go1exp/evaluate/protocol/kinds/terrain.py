@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -15,10 +15,12 @@ from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, lives, repeated
 from go1exp.evaluate.protocol.ground import GOAL, UNITS, GroundName, Lanes
 from go1exp.evaluate.protocol.plan import Motion, Plan
-from go1exp.evaluate.quantities import Column, Derived, Row, values
+from go1exp.evaluate.quantities import Column, Derived, Row, Summaries, Summary, values
 from go1exp.evaluate.statistics.intervals import Logistic, logistic_fit
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
     from go1exp.evaluate.protocol.stage import Stage
 
 SHARES = {"at_half": 0.5, "at_95": 0.95}
@@ -140,7 +142,7 @@ class OnTerrain(Protocol):
                     figures.append(Derived(key, UNITS[name], text, condition, "higher", function))
         return figures
 
-    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[plots.Drawing]:
+    def compared(self, plays: Mapping[str, Played], summaries: Summaries) -> list[plots.Drawing]:
         """Draw the curves of all subjects."""
         text = "Share that reached the end of its lane, Wilson's 95 % interval and logistic fit; slopes in degrees."
         return [plots.Drawing("success", "Success against difficulty", text, partial(_success, plays, summaries))]
@@ -161,7 +163,7 @@ def _where(rows: Sequence[Row], share: float, top: float) -> float:
     return float(np.clip(fit.where(share), 0.0, top))
 
 
-def _success(plays: Mapping[str, Played], summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> plots.Figure:
+def _success(plays: Mapping[str, Played], summaries: Summaries) -> plots.Figure:
     grounds = list(dict.fromkeys(e["condition"]["ground"] for e in next(iter(summaries.values()))))
     columns = 2 if len(grounds) > 1 else 1
     figure, axes = plots.panels(-(-len(grounds) // columns), columns, height=1.6, sharey=True)
@@ -179,9 +181,7 @@ def _success(plays: Mapping[str, Played], summaries: Mapping[str, Sequence[Mappi
     return figure
 
 
-def _curve(
-    ax: Any, rows: Sequence[Row], summary: Sequence[Mapping[str, Any]], ground: str, who: str, colour_from: int
-) -> None:
+def _curve(ax: Axes, rows: Sequence[Row], summary: Summary, ground: str, who: str, colour_from: int) -> None:
     """Draw the success of one subject on one ground, a line for each speed."""
     for k, speed in enumerate(dict.fromkeys(r["speed"] for r in rows)):
         condition = {"ground": ground, "speed": speed}
