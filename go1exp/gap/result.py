@@ -36,7 +36,7 @@ ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180}
 """Unit of an angle -> rad."""
 
 
-def in_rad(given: Any) -> Any:
+def in_rad(given: object) -> object:
     """Return an angle with a unit, such as ``2mrad``, in rad; anything else as it is."""
     if not isinstance(given, str):
         return given

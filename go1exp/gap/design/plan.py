@@ -145,7 +145,7 @@ def limits_of(robot: Robot, windows: Windows, targets: Sequence[np.ndarray], saf
 
 SIZES = ("amplitude", "large", "stride", "lift", "sway")  # parameters of excitations that say how far the joints go
 
-MOTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
+MOTIONS: tuple[tuple[str, Mapping[str, float | Sequence[float]]], ...] = (
     ("chirp", {"band": (0.1, 4.0)}),
     ("chirp", {"band": (0.5, 10.0)}),
     ("multisine", {"band": (0.15, 8.0)}),

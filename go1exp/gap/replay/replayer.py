@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -19,6 +19,9 @@ from go1exp.sim.effects.base import Measured
 from go1exp.sim.env.plant import FRICTION, Plant
 from go1exp.sim.physics.backend import PhysicsBackend
 
+if TYPE_CHECKING:
+    from go1exp.gap.replay.walking import ImuRecorder
+
 LEVEL = (1.0, 0.0, 0.0, 0.0)  # attitude of a trunk that is held level, w-x-y-z
 
 
@@ -32,7 +35,9 @@ class Replayer:
     max_rows: int
     threads: int
     made: int = 0
-    _backends: dict[tuple[int, float, bool], tuple[Any, ActuatorSetup, set[str]]] = field(default_factory=dict)
+    _backends: dict[tuple[int, float, bool], tuple[PhysicsBackend, ActuatorSetup, set[str]]] = field(
+        default_factory=dict
+    )
     _inputs: dict[float, tuple[Tensor, Tensor]] = field(default_factory=dict)
 
     def run(self, rows: Rows, dt: float) -> np.ndarray:
@@ -125,7 +130,7 @@ class Replayer:
         """Return a replayer of the same windows with other quantities (``Windows.observable``): with torques."""
         return Replayer(self.machine, windows, self.quats, self.max_rows, self.threads)
 
-    def _recorder(self, steps: int, rows: int) -> Any:
+    def _recorder(self, steps: int, rows: int) -> ImuRecorder | None:
         """Return what records more than the joints, or None."""
         return None
 

@@ -14,6 +14,7 @@ from go1exp.config.schema.registry import Term, bind
 from go1exp.robot import MOUNT_HINGES, MOUNT_SLIDES
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.effects.tolerances import Tolerances, declared, effect_class, sizes
+from go1exp.sim.physics.backend import PhysicsBackend
 
 
 class Machine(Protocol):
@@ -52,7 +53,7 @@ class Machine(Protocol):
 
     def build(
         self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False
-    ) -> tuple[Any, ActuatorSetup]:
+    ) -> tuple[PhysicsBackend, ActuatorSetup]:
         """Return a backend with ``num`` robots that steps by ``physics_dt`` s, and their drives.
 
         A base that is held has the attitude ``base_quat``, w-x-y-z, and if ``mounted`` the joints of

@@ -11,8 +11,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
+import mujoco
 import numpy as np
 import torch
 from torch import Tensor
@@ -96,14 +97,14 @@ class FixedBase:
         model = self.model(0.001, (1.0, 0.0, 0.0, 0.0))
         return np.where(model.jnt_limited[:, None], model.jnt_range, np.nan)
 
-    def model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool = False) -> Any:
+    def model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool = False) -> mujoco.MjModel:
         """Return the compiled MuJoCo model; the base of one that is ``mounted`` can move."""
         file, base = Path(self.config.mjcf), self.config.base
         return build_fixed_base(file, base, self.joints, self.effort, physics_dt, base_quat, mounted)
 
     def build(
         self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False
-    ) -> tuple[Any, ActuatorSetup]:
+    ) -> tuple[MujocoCpu, ActuatorSetup]:
         """Return a backend with ``num`` robots, and their drives."""
         backend = MujocoCpu(self.model(physics_dt, base_quat, mounted), NO_SENSORS, num, threads)
         like = backend.qpos

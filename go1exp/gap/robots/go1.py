@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, cast
+from typing import ClassVar, cast
 
+import mujoco
 import numpy as np
 
 from go1exp import robot
@@ -29,7 +30,7 @@ from go1exp.robot.config import RobotConfig
 from go1exp.sim.effects.tolerances import DECLARED, Tolerances
 from go1exp.sim.env.plant import actuator_setup
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu
-from go1exp.sim.physics.scene import build_model, weigh_down
+from go1exp.sim.physics.scene import Sensors, build_model, weigh_down
 from go1exp.sim.terrain import TerrainConfig, build_terrain
 
 GO1 = "go1"
@@ -109,13 +110,13 @@ class Go1:
 
     def build(
         self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False
-    ) -> tuple[Any, ActuatorSetup]:
+    ) -> tuple[MujocoCpu, ActuatorSetup]:
         """Return a backend with ``num`` robots, and their drives; a free trunk has no use for ``base_quat``."""
         model, blocks = self._model(physics_dt, base_quat, mounted)
         backend = MujocoCpu(model, blocks, num, threads)
         return backend, actuator_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
 
-    def _model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool) -> tuple[Any, Any]:
+    def _model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool) -> tuple[mujoco.MjModel, Sensors]:
         raise NotImplementedError
 
 
@@ -129,7 +130,7 @@ class StandingGo1(Go1):
     contact: ContactConfig = MUJOCO_CONTACT
     held: Machine = field(kw_only=True)
 
-    def _model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool) -> tuple[Any, Any]:
+    def _model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool) -> tuple[mujoco.MjModel, Sensors]:
         ground = build_terrain(TerrainConfig(kind="flat"))
         model, blocks = build_model(self.config, ground, physics_dt, contact=self.contact)
         model.opt.disableflags |= NO_SENSORS
@@ -159,7 +160,7 @@ class SwingingGo1(Go1):
 
     base_probe: tuple[float, ...] = IMU_PROBE
 
-    def _model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool) -> tuple[Any, Any]:
+    def _model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool) -> tuple[mujoco.MjModel, Sensors]:
         model, blocks = build_model(self.config, None, physics_dt)
         weigh_down(model, HEAVY)
         return model, blocks
@@ -195,7 +196,7 @@ class SuspendedGo1(Go1):
         """Lowest and highest angle (J, 2), rad."""
         return robot.JOINT_POS_LIMITS.copy()
 
-    def _model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool) -> tuple[Any, Any]:
+    def _model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool) -> tuple[mujoco.MjModel, Sensors]:
         w, x, y, z = base_quat
         return build_model(self.config, None, physics_dt, held=(w, x, y, z), mounted=mounted)
 

@@ -89,7 +89,7 @@ def model_of(result: GapResult, robot: Robot) -> Theta:
     return theta_of(terms_of(composed({e: _as_file(p) for e, p in result.box.items()}, named)), robot.joints)
 
 
-def _as_file(params: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
+def _as_file(params: Mapping[str, Mapping[str, float]]) -> dict[str, float | dict[str, float]]:
     """Return values as an effect file has them: a number for one of the robot."""
     return {name: places["robot"] if set(places) == {"robot"} else dict(places) for name, places in params.items()}
 
