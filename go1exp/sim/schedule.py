@@ -39,7 +39,7 @@ FEET_CONTACT_FIELD = "geom_solref"
 KEYS = ("set", "from", "to", "start", "over", "when", "unit", "optional")
 
 
-def parse(settings: Any, parts: Mapping[str, Any]) -> tuple[dict[str, Ramp], list[str]]:
+def parse(settings: object, parts: Mapping[str, Any]) -> tuple[dict[str, Ramp], list[str]]:
     """Validate the group ``schedule`` against the other parts of a configuration; return its ramps and the problems."""
     if not isinstance(settings, Mapping):
         return {}, [f"schedule = {settings!r}: must be a mapping of ramps"]

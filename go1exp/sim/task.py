@@ -245,7 +245,7 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind)
 
 
-def _section(kind: type, settings: Any, path: str) -> tuple[Any, list[str]]:
+def _section(kind: type, settings: object, path: str) -> tuple[Any, list[str]]:
     """Validate one section; return the dataclass (or None) and the problems."""
     if not isinstance(settings, Mapping):
         return None, [f"{path} = {settings!r}: must be a mapping"]
@@ -255,7 +255,7 @@ def _section(kind: type, settings: Any, path: str) -> tuple[Any, list[str]]:
         return None, explain(error, path, [f.name for f in fields(kind)])
 
 
-def _terms(group: str, settings: Any) -> tuple[tuple[Term, ...], list[str]]:
+def _terms(group: str, settings: object) -> tuple[tuple[Term, ...], list[str]]:
     if not isinstance(settings, Mapping):
         return (), [f"{group} = {settings!r}: must be a mapping of terms"]
     kind, slots = REGISTERED_AS.get(group, group), MANY_TERMS[group]

@@ -32,7 +32,7 @@ InnerActuator = Annotated[dict[str, Any], AfterValidator(_checked)]
 """``{term: pd, kp: 20.0, ...}``: type of a parameter called ``drive``."""
 
 
-def build(setup: ActuatorSetup, drive: dict[str, Any]) -> Any:
+def build(setup: ActuatorSetup, drive: dict[str, Any]) -> Actuator:
     """Return the actuator that ``drive`` describes."""
     parameters = {k: v for k, v in drive.items() if k != "term"}
     return members("actuator")[drive["term"]].target(setup, **parameters)

@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -92,7 +92,7 @@ class GroupedMLP:
         self._x, self._out = ones(weights[0][0].shape[1], total), ones(OUTPUTS, total)
         self.inputs = self._x[1:].zero_()
         work, spare = [ones(1 + widest, block), ones(1 + widest, block)], ones(widest, block)
-        self._calls: list[tuple[Callable[..., Any], tuple[Any, ...], Tensor]] = []
+        self._calls: list[tuple[Callable[..., Tensor], tuple[Tensor | float, ...], Tensor]] = []
         for pieces in _blocks(columns, block):
             self._add_layers(pieces, weights, work, spare)
             if any(skip.any() for skip in skips):

@@ -11,7 +11,7 @@ import inspect
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, Field
 
@@ -148,7 +148,7 @@ class Param:
         return self.low if self.least is None else self.least
 
     @property
-    def annotation(self) -> Any:
+    def annotation(self) -> object:
         """Type of the YAML value."""
         if self.least is not None:
             return Annotated[float, Field(ge=self.low, le=self.high), AfterValidator(self._apart)]
@@ -230,7 +230,7 @@ class Effect(Memory):
         def __getattr__(self, name: str) -> Tensor:
             """Values of the parameter ``name``, (N, J) or (N, 1)."""
 
-    def __init_subclass__(cls, **kwargs: Any) -> None:
+    def __init_subclass__(cls, **kwargs: object) -> None:
         super().__init_subclass__(**kwargs)
         cls.joint_values = tuple(p.name for p in cls.params if p.per == "joint")
         cls.memory = (*(p.name for p in cls.params), *cls.memory)

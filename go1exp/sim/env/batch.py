@@ -41,7 +41,7 @@ def make(
     return Go1Core(task, num_envs, seed, noise=noise, spread_starts=spread_starts)
 
 
-def task_of(overrides: Any) -> TaskConfig:
+def task_of(overrides: object) -> TaskConfig:
     """Return the task of ``go1exp train`` with overrides; raise ConfigError, as the command line does."""
     from go1exp.config.compose import compose_checked
 

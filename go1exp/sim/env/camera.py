@@ -168,7 +168,7 @@ class Stage:
         task = self.core.task
         return build_model(task.robot, self._window, task.sim.physics_dt, self._decoration, contact=task.contact)[0]
 
-    def _cut(self, xy: Any) -> Terrain:
+    def _cut(self, xy: tuple[float, float]) -> Terrain:
         """Return the ground within GROUND_RANGE of a place, or as much as there is."""
         whole = self.core.terrain
         size = 2 * round(GROUND_RANGE / whole.resolution) + 1

@@ -115,11 +115,11 @@ class Go1VecEnv(VecEnv):
         value = None if attr_name == "render_mode" else getattr(self.core, attr_name)
         return [value] * self._count(indices)
 
-    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+    def set_attr(self, attr_name: str, value: object, indices: VecEnvIndices = None) -> None:
         """Refuse: the environments share one core."""
         raise NotImplementedError(f"{attr_name!r}: environments of a batch cannot differ in attributes")
 
-    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
+    def env_method(self, method_name: str, *args: object, indices: VecEnvIndices = None, **kwargs: object) -> list[Any]:
         """Refuse: there are no single environments to call."""
         raise NotImplementedError(f"{method_name!r}: environments of a batch have no methods of their own")
 

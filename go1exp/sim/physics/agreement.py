@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
-from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from go1exp import robot
@@ -140,7 +140,7 @@ def _unlike(names: Sequence[str], others: Sequence[str]) -> int:
     return sum(a != b for a, b in zip_longest(names, others))
 
 
-def _largest(difference: Any) -> float:
+def _largest(difference: ArrayLike) -> float:
     """Return the largest absolute value; what is not a number stays so."""
     return float(np.abs(np.asarray(difference)).max())
 

@@ -57,7 +57,7 @@ class _Replay:
     """A CUDA graph, and what owns the memory that it works on."""
 
     graph: torch.cuda.CUDAGraph
-    kept: tuple[Any, ...]
+    kept: tuple[object, ...]
 
     def __call__(self) -> None:
         self.graph.replay()
@@ -92,7 +92,7 @@ class MujocoWarp:
         if device != "cpu" and not torch.cuda.is_available():
             raise ConfigError([f"backend.device = {device!r}: torch finds no CUDA device; use backend=cpu"])
         wp.init()
-        self._streams: dict[int, Any] = {}
+        self._streams: dict[int, wp.Stream] = {}
         self.model, self.sensors, self.num_envs = model, sensors, num_envs
         self.device = torch.device("cuda", torch.cuda.current_device()) if device == "cuda" else torch.device(device)
         self._wp_device = wp.device_from_torch(self.device)
@@ -131,7 +131,7 @@ class MujocoWarp:
             with wp.ScopedStream(self._stream(torch.cuda.current_stream(self.device)), sync_enter=False):
                 yield
 
-    def _stream(self, stream: torch.cuda.Stream) -> Any:
+    def _stream(self, stream: torch.cuda.Stream) -> wp.Stream:
         """Return warp's name for a stream of torch, always the same object: a capture is known by it."""
         if stream.cuda_stream not in self._streams:
             self._streams[stream.cuda_stream] = wp.stream_from_torch(stream)
@@ -180,7 +180,7 @@ class MujocoWarp:
             self._fields[name] = wp.to_torch(array)
         return self._fields[name]
 
-    def _place(self, name: str) -> tuple[Any, str]:
+    def _place(self, name: str) -> tuple[object, str]:
         """Return the object that holds a field, and its name there."""
         *path, attribute = name.split(".")
         return (attrgetter(".".join(path))(self._model) if path else self._model), attribute

@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from go1exp.config.schema.physics import PhysxBackend
@@ -54,12 +54,12 @@ def rotation(w_x_y_z: np.ndarray) -> Rotation:
     return Rotation.from_quat(w_x_y_z, scalar_first=True)
 
 
-def pose(position: Any, w_x_y_z: Any) -> Any:
+def pose(position: ArrayLike, w_x_y_z: ArrayLike) -> sapien.Pose:
     """Return a pose in PhysX's single precision."""
     return sapien.Pose(np.asarray(position, dtype=np.float32), np.asarray(w_x_y_z, dtype=np.float32))
 
 
-def ground_shape(model: mujoco.MjModel, settings: PhysxBackend) -> Any:
+def ground_shape(model: mujoco.MjModel, settings: PhysxBackend) -> physx.PhysxCollisionShape:
     """Return the ground as one shape that all robots' systems share: a plane, or a height field's triangles.
 
     A cell of the field is split along the diagonal along which MuJoCo splits it (``go1exp.sim.terrain.Terrain``).
@@ -79,7 +79,7 @@ def ground_shape(model: mujoco.MjModel, settings: PhysxBackend) -> Any:
     return _meeting(shape, FLOOR_GROUPS, settings)
 
 
-def _meeting(shape: Any, groups: list[int], settings: PhysxBackend) -> Any:
+def _meeting(shape: physx.PhysxCollisionShape, groups: list[int], settings: PhysxBackend) -> physx.PhysxCollisionShape:
     """Return a shape that meets what it is to meet, at no distance."""
     shape.set_collision_groups(groups)
     shape.contact_offset, shape.rest_offset = settings.contact_offset, 0.0
@@ -112,7 +112,7 @@ class PhysxRobot:
         order: for each joint of MuJoCo the place that PhysX gives it.
     """
 
-    def __init__(self, model: mujoco.MjModel, settings: PhysxBackend, ground: Any) -> None:
+    def __init__(self, model: mujoco.MjModel, settings: PhysxBackend, ground: physx.PhysxCollisionShape) -> None:
         """Build it.
 
         Raises:
@@ -127,8 +127,8 @@ class PhysxRobot:
         self._scene = sapien.Scene([self.system])
         floor = physx.PhysxRigidStaticComponent()
         floor.attach(ground)
-        self._materials: dict[int, Any] = {}
-        self.links: list[Any] = []
+        self._materials: dict[int, physx.PhysxMaterial] = {}
+        self.links: list[physx.PhysxArticulationLinkComponent] = []
         for body in range(1, model.nbody):
             self.links.append(self._link(body))
         for component in (floor, *self.links):
@@ -144,7 +144,7 @@ class PhysxRobot:
 
     # ------------------------------------------------------------------ construction
 
-    def _link(self, body: int) -> Any:
+    def _link(self, body: int) -> physx.PhysxArticulationLinkComponent:
         """Make one link with its shapes and its joint."""
         model, parent = self._model, int(self._model.body_parentid[body])
         link = physx.PhysxArticulationLinkComponent(self.links[parent - 1] if parent else None)
@@ -169,7 +169,7 @@ class PhysxRobot:
         self._hinge(link.joint, body, joints[0])
         return link
 
-    def _hinge(self, hinge: Any, body: int, joint: int) -> None:
+    def _hinge(self, hinge: physx.PhysxArticulationJoint, body: int, joint: int) -> None:
         """Make a link's joint, whose axis PhysX has along the x axis of the joint's frame."""
         model, axis = self._model, self._model.jnt_axis[joint]
         z_to_axis = np.zeros(4)
@@ -186,7 +186,7 @@ class PhysxRobot:
         hinge.set_armature(model.dof_armature[[dof]])
         hinge.set_drive_properties(0.0, *dry_friction(float(model.dof_frictionloss[dof])))
 
-    def _shape(self, geom: int) -> Any:
+    def _shape(self, geom: int) -> physx.PhysxCollisionShape:
         """Make a collision shape of a geom."""
         model, size = self._model, self._model.geom_size[geom]
         mu = 2.0 * float(pair_friction(model, geom, model.geom_friction))

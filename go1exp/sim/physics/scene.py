@@ -6,7 +6,6 @@ Whatever the MDP needs beyond qpos and qvel is a sensor declared here.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -112,7 +111,7 @@ def _add_sun(spec: mujoco.MjSpec) -> None:
     spec.visual.rgba.haze = [0.42, 0.51, 0.61, 1.0]  # the sky at the horizon
 
 
-TRUNK_WITH_HIP_ROTORS: dict[str, Any] = {
+TRUNK_WITH_HIP_ROTORS = {
     "mass": 5.560,
     "ipos": [0.020872158, 0.001871942, -0.000467986],
     "fullinertia": [0.0180397001, 0.0678915698, 0.0773160421, -2.44537877e-4, -2.90814056e-4, -4.15398942e-5],

@@ -9,9 +9,8 @@ translation and by rotation, ``dof_invweight0`` the diagonal of M^-1, averaged o
 
 from __future__ import annotations
 
-from typing import Any
-
 import mujoco
+import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
@@ -214,7 +213,7 @@ class DerivedConstants:
         self._response = wp.zeros((num_envs, nv + 6 * model.nbody), dtype=float)
         self._shape = num_envs, nv, int(model.nbody)
 
-    def update(self, model: Any, mask: wp.array) -> None:
+    def update(self, model: mjw.Model, mask: wp.array) -> None:
         """Write ``DERIVED``, which must be per environment in the ``mujoco_warp.Model``, in the rows of ``mask``."""
         n, nv, nbody = self._shape
         tree = [self._moves, self._lin, self._ang, self._at, self._xpos, self._xmat]

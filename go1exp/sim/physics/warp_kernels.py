@@ -7,7 +7,6 @@ each contact knows its sensors. That is a fifth of a physics step. The readings 
 from __future__ import annotations
 
 import inspect
-from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
@@ -70,7 +69,7 @@ class ContactReadings:
         self._ids = wp.array(np.arange(capacity), dtype=int)
         self._force = wp.zeros(capacity, dtype=wp.spatial_vector)
 
-    def update(self, model: Any, data: Any) -> None:
+    def update(self, model: mjw.Model, data: mjw.Data) -> None:
         """Add the contacts of the last pass to readings that are zero."""
         mjw.contact_force(model, data, self._ids, True, self._force)
         c = data.contact
@@ -78,7 +77,7 @@ class ContactReadings:
         wp.launch(_collect, len(self._ids), inputs=inputs, outputs=[data.sensordata])
 
 
-def without_contact_sensors(model: Any) -> None:
+def without_contact_sensors(model: mjw.Model) -> None:
     """Let a ``mujoco_warp.Model`` leave its contact sensors at zero."""
     for stage in ("pos", "vel", "acc"):
         setattr(model, f"sensor_contact_{stage}_adr", wp.zeros(0, dtype=int))
