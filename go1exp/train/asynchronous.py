@@ -120,7 +120,7 @@ class AsyncEvaluation:
             with opened(file) as written:
                 torch.save({**state, "policy": ppo.policy.state_dict()}, written)
         section = self._config.eval if kind == "evaluate" else self._config.video
-        job: dict[str, Any] = {"kind": kind, "policy": str(file), "settings": dataclasses.asdict(section)}
+        job: dict[str, object] = {"kind": kind, "policy": str(file), "settings": dataclasses.asdict(section)}
         job |= {"iteration": ppo.iteration, "steps": ppo.num_timesteps}
         if kind == "video":
             job["out"] = str(self._run / VIDEOS / f"{ppo.iteration:06d}.mp4")

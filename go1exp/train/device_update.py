@@ -8,7 +8,6 @@ reads six numbers a minibatch back, which costs more than the arithmetic.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
 
 import torch
 from stable_baselines3.common.type_aliases import RolloutBufferSamples
@@ -45,7 +44,7 @@ class DeviceRolloutBuffer(MeanRolloutBuffer):
     def reset(self) -> None:
         """Empty the buffer; its memory is made once."""
         if not hasattr(self, "data"):
-            shapes: dict[str, Any] = {
+            shapes = {
                 "observations": self.obs_shape,
                 "actions": (self.action_dim,),
                 "means": (self.action_dim,),
@@ -284,5 +283,5 @@ def _moments(state: Mapping[Tensor, dict[str, Tensor]]) -> list[Tensor]:
     return [value for of_parameter in state.values() for value in of_parameter.values()]
 
 
-def _clone(state: dict[str, Any] | None) -> dict[str, Tensor]:
+def _clone(state: dict[str, Tensor] | None) -> dict[str, Tensor]:
     return {name: value.clone() for name, value in (state or {}).items()}

@@ -9,7 +9,6 @@ import math
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 from go1exp.base.files import write_json
 from go1exp.config.schema.registry import unknown_name
@@ -31,7 +30,7 @@ class EarlyStop:
             if k <= iteration:
                 self._take(k, value)
 
-    def reason(self, iteration: int, metrics: Mapping[str, Any]) -> str:
+    def reason(self, iteration: int, metrics: Mapping[str, float]) -> str:
         """Return why training shall end after ``iteration`` with these metrics; empty if it shall go on."""
         rule = self._rule
         if rule.figure is None:

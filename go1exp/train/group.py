@@ -22,7 +22,7 @@ from datetime import timedelta
 from multiprocessing import connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 import torch.distributed as dist
@@ -31,6 +31,8 @@ from torch import Tensor, nn
 
 from go1exp.base.errors import Expected
 from go1exp.train import run_state
+
+T = TypeVar("T")
 
 PATIENCE = 180.0
 """Time after which a member that waits for the others gives up, s; kernels are compiled in the first iteration."""
@@ -92,7 +94,7 @@ class Group:
                 torch.cuda.synchronize()
             dist.barrier(group=_by_host())
 
-    def agreed(self, value: Any) -> Any:
+    def agreed(self, value: T) -> T:
         """Return the first member's ``value``, plain data."""
         if self.size == 1:
             return value
@@ -132,8 +134,8 @@ class Group:
 
         return _mapped(state, share)
 
-    def _of_all(self, local: Any) -> list[Any]:
-        each: list[Any] = [None] * self.size
+    def _of_all(self, local: T) -> list[T]:
+        each = [local] * self.size
         dist.all_gather_object(each, local, group=_by_host())
         return each
 
@@ -171,10 +173,10 @@ def leave() -> None:
         dist.destroy_process_group()
 
 
-_HOST_GROUP: Any = None
+_HOST_GROUP: dist.ProcessGroup | None = None
 
 
-def _by_host() -> Any:
+def _by_host() -> dist.ProcessGroup | None:
     """Return the group that exchanges plain data through the host's memory."""
     return _HOST_GROUP
 
@@ -225,7 +227,7 @@ class SharedNoise(DiagGaussianDistribution):
         return spread.mean + spread.stddev * noise
 
 
-Work = Callable[[dict[str, Any], Path, Group], Any]
+Work = Callable[[dict[str, Any], Path, Group], object]
 """What a member does: with the configuration as plain data, the run folder and its group."""
 
 ENDED_EARLY = "a process of another GPU ended early"

@@ -14,6 +14,7 @@ import uuid
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from stable_baselines3.common.logger import HParam, KVWriter, Logger, TensorBoardOutputFormat
@@ -36,7 +37,7 @@ EXPORTING = 600.0
 """Longest time for packing the bundle, s."""
 
 
-def _wandb() -> Any:
+def _wandb() -> ModuleType:
     try:
         import wandb
     except ImportError as error:

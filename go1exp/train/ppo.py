@@ -22,8 +22,9 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import MlpExtractor
 from stable_baselines3.common.type_aliases import RolloutBufferSamples
 from stable_baselines3.common.utils import explained_variance, safe_mean
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch import Tensor, nn
+from torch.optim import Optimizer
 
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.faults import NumericalFault
@@ -185,7 +186,7 @@ class MeanRolloutBuffer(RolloutBuffer):
             self.means = self.swap_and_flatten(self.means)
         yield from super().get(batch_size)
 
-    def _get_samples(self, batch_inds: np.ndarray, env: Any = None) -> RolloutBufferSamples:
+    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> RolloutBufferSamples:
         self.current_means = self.to_torch(self.means[batch_inds])
         return super()._get_samples(batch_inds, env)
 
@@ -253,7 +254,7 @@ class AdaptivePPO(PPO):
     def _maybe_recommend_cpu(self, mlp_class_name: str = "ActorCriticPolicy") -> None:
         """Say nothing: the user chose the device."""
 
-    def _update_learning_rate(self, optimizers: Any) -> None:
+    def _update_learning_rate(self, optimizers: list[Optimizer] | Optimizer) -> None:
         """Leave the rate where the last minibatch put it; SB3 would set it from a schedule over time."""
 
     def _check_gradient(self, name: str, parameter: Tensor) -> None:

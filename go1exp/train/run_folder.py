@@ -62,7 +62,7 @@ def write(run: Path, container: dict[str, Any]) -> None:
         raise OSError(error.errno, f"run folder cannot be written: {error.strerror}", str(run)) from error
 
 
-def _with_files(actuator: Any) -> Iterator[dict[str, Any]]:
+def _with_files(actuator: object) -> Iterator[dict[str, Any]]:
     """The settings of an actuator, or of one that it wraps, which name a file."""
     if isinstance(actuator, dict):
         if isinstance(actuator.get("file"), str):
@@ -270,7 +270,7 @@ def _used(container: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         for key, settings in (container.get(group) or {}).items():
             yield REGISTERED_AS.get(group, group), str((settings or {}).get("term", key))
     for group in ONE_TERM:
-        inner: Any = container.get(group)
+        inner = container.get(group)
         while isinstance(inner, Mapping):  # an actuator may wrap another
             yield group, str(inner.get("term"))
             inner = inner.get("drive")

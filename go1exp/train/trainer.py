@@ -48,8 +48,7 @@ class Progress:
         self._first, self._last, self._size = iteration, iterations, steps_per_iteration
         self._start = time.monotonic()
         self._printed = -LINE_PERIOD
-        self._bar: Any = None
-        self._task: Any = None
+        self._bar: Bar | None = None
         if sys.stderr.isatty():
             from rich.console import Console
             from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
@@ -62,7 +61,7 @@ class Progress:
                 TextColumn("{task.description}"),
                 console=Console(stderr=True),
             )
-            self._task = self._bar.add_task("starting", total=iterations, completed=iteration)
+            self._bar.add_task("starting", total=iterations, completed=iteration)
 
     def __enter__(self) -> Progress:
         """Show the bar."""
@@ -77,7 +76,7 @@ class Progress:
         if self._bar:
             self._bar.stop()
 
-    def update(self, iteration: int, metrics: dict[str, Any]) -> None:
+    def update(self, iteration: int, metrics: dict[str, float]) -> None:
         """Show the metrics of ``iteration``."""
         elapsed = time.monotonic() - self._start
         rate = (iteration - self._first) * self._size / max(elapsed, 1e-9)
@@ -93,7 +92,7 @@ class Progress:
                 parts.append(f"{label} {form.format(metrics[key])}")
         text = "  ".join(parts)
         if self._bar:
-            self._bar.update(self._task, completed=iteration, description=text)
+            self._bar.update(self._bar.task_ids[0], completed=iteration, description=text)
         elif elapsed - self._printed >= LINE_PERIOD or iteration == self._last:
             self._printed = elapsed
             left = (self._last - iteration) * elapsed / max(iteration - self._first, 1)
@@ -158,7 +157,7 @@ def build(config: TrainConfig, group: Group | None = None) -> AdaptivePPO:
         torch.set_num_threads(config.process.torch_threads)
     group, seed = group or Group(), config.process.seed
     local = group.rows(config.ppo.num_envs)
-    share: dict[str, Any] = {"num_envs": local.stop - local.start, "first_env": local.start}
+    share = {"num_envs": local.stop - local.start, "first_env": local.start}
     share["changing"] = {ramp.path for ramp in config.schedule.values()}
     core = Go1Core(trained_task(config), seed=seed, **share, spread_starts=config.task.sim.spread_starts, critic=True)
     device = str(core.device) if config.process.device == "auto" else config.process.device

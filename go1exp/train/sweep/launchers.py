@@ -9,7 +9,7 @@ import os
 import queue
 import signal
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import replace
 from pathlib import Path
@@ -164,7 +164,9 @@ def shares(cores: Sequence[int], at_once: int, threads: int = 0) -> list[tuple[i
     return [tuple(sorted(ring[(k * width) % len(cores) :][:width])) for k in range(at_once)]
 
 
-LAUNCHERS: dict[str, tuple[Any, Any]] = {
+Settings = BasicSettings | JoblibSettings | slurm.SlurmSettings | ray_cluster.RaySettings
+
+LAUNCHERS: dict[str, tuple[type[Settings], Callable[..., Launcher]]] = {
     "basic": (BasicSettings, Basic),
     "joblib": (JoblibSettings, Local),
     "slurm": (slurm.SlurmSettings, slurm.Slurm),
@@ -196,7 +198,6 @@ def chosen(container: Mapping[str, Any]) -> Any:
         raise ConfigError([f"hydra.launcher.{problem}" for problem in error.problems]) from None
 
 
-def built(settings: Any) -> Launcher:
+def built(settings: Settings) -> Launcher:
     """Return the launcher with these settings."""
-    launcher: Launcher = LAUNCHERS[settings.name][1](settings)
-    return launcher
+    return LAUNCHERS[settings.name][1](settings)

@@ -13,9 +13,13 @@ import uuid
 from collections.abc import Iterator
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from go1exp.train import run_state
+
+if TYPE_CHECKING:
+    import optuna
+    from optuna.trial import BaseTrial, FrozenTrial
 
 FOLDER = "folder"
 """Attribute of a trial that was stopped, and of the one that goes on with it: its run folder."""
@@ -45,7 +49,7 @@ def alive(folder: Path) -> Iterator[str]:
     shutil.rmtree(folder / SEARCHES / name, ignore_errors=True)  # after an exception it tells that its trials are free
 
 
-def sampler(seed: int, number: int, parallel: bool) -> Any:
+def sampler(seed: int, number: int, parallel: bool) -> optuna.samplers.TPESampler:
     """Return what draws the settings of one trial.
 
     A sampler that lived as long as its process would draw the same again in every process that goes on, and on every
@@ -67,7 +71,7 @@ PATIENCE_S = 60.0
 """Longest wait for the training that a killed search left, s; after that the search goes on with others."""
 
 
-def put_back(study: Any, folder: Path, patience: float = PATIENCE_S) -> bool:
+def put_back(study: optuna.Study, folder: Path, patience: float = PATIENCE_S) -> bool:
     """Put the trials of searches that were killed in front, so that they go on in their run folders.
 
     Returns whether some stay as they are: their trainings still ran after ``patience``, or it is unknown yet whose they
@@ -103,7 +107,7 @@ def put_back(study: Any, folder: Path, patience: float = PATIENCE_S) -> bool:
     return some_left
 
 
-def go_on(study: Any, trial: Any, run: str) -> None:
+def go_on(study: optuna.Study, trial: BaseTrial, run: str) -> None:
     """Put in front the trial that goes on with a stopped one, unless that is done already.
 
     To be called before the stopped one counts as failed: a search that is killed between the two has its trial still
@@ -120,13 +124,13 @@ def go_on(study: Any, trial: Any, run: str) -> None:
         study.enqueue_trial(params, user_attrs={FOLDER: run, CONTINUES: trial.number})
 
 
-def is_superfluous(study: Any, trial: Any) -> bool:
+def is_superfluous(study: optuna.Study, trial: BaseTrial) -> bool:
     """Whether an older trial goes on with the same one as this does: two searches may have put it in front at once."""
     continued = trial.user_attrs.get(CONTINUES)
     return continued is not None and min(_continuations(study, continued)) < trial.number
 
 
-def ask(study: Any) -> Any:
+def ask(study: optuna.Study) -> optuna.Trial:
     """Return Optuna's next trial that is not superfluous; those that are have failed."""
     from optuna.trial import TrialState
 
@@ -135,12 +139,12 @@ def ask(study: Any) -> Any:
     return trial
 
 
-def _continuations(study: Any, number: int) -> list[int]:
+def _continuations(study: optuna.Study, number: int) -> list[int]:
     """Return the numbers of the trials that go on with trial ``number``."""
     return [t.number for t in study.get_trials(deepcopy=False) if t.user_attrs.get(CONTINUES) == number]
 
 
-def _is_run(trial: Any, folder: Path) -> bool:
+def _is_run(trial: FrozenTrial, folder: Path) -> bool:
     """Whether a search runs the trial; also where that cannot be known from here."""
     search, run = trial.user_attrs.get(SEARCH), trial.user_attrs.get(FOLDER)
     if search:
@@ -151,7 +155,7 @@ def _is_run(trial: Any, folder: Path) -> bool:
     return bool(datetime.now() - trial.datetime_start < NAMELESS)
 
 
-def is_nameless(trial: Any) -> bool:
+def is_nameless(trial: FrozenTrial) -> bool:
     """Whether a running trial names neither search nor folder: it has just begun, or its search was killed then."""
     return trial.state.name == "RUNNING" and not {SEARCH, FOLDER} & {*trial.user_attrs}
 
