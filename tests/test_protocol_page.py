@@ -25,7 +25,7 @@ from go1exp.evaluate.protocol.pages import (
     page,
 )
 from go1exp.evaluate.protocol.playing import Result, summarised
-from go1exp.evaluate.statistics.intervals import ConditionSummary, Estimate
+from go1exp.evaluate.statistics.intervals import Estimate, SummaryEntry
 from tests.phone import PHONE, needs_chromium, on_a_phone
 
 
@@ -123,7 +123,7 @@ def test_units_are_those_of_the_ground() -> None:
         "slope_up": {"estimate": 20.0, "low": 18.0, "high": 22.0, "n": 4, "unit": "deg"},
         "gravel": {"estimate": 0.05, "low": 0.04, "high": 0.06, "n": 4, "unit": "m"},
     }
-    summary: list[ConditionSummary] = [
+    summary: list[SummaryEntry] = [
         {"condition": {"ground": g, "speed": 1.0}, "n": 4, "figures": {"at_half": f}} for g, f in half.items()
     ]
     verdicts = evaluated(one.protocol.claims, summary)

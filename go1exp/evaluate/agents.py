@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Protocol
 
@@ -50,7 +50,7 @@ class Agent:
 
     label: str  # name in reports
     task: TaskConfig  # the robot, rates and observations that it was made for
-    about: dict[str, Any] = field(default_factory=dict, kw_only=True)  # plain data on its origin, for reports
+    about: Mapping[str, object] = field(default_factory=dict, kw_only=True)  # plain data on its origin, for reports
     senses: ClassVar[bool] = False  # whether it reads the robots' sensors itself, the IMU too, at a rate of its own
 
     def problems(self, trunk_velocity: TrunkVelocity, key: str) -> list[str]:

@@ -16,7 +16,7 @@ from go1exp import robot
 from go1exp.base.files import replacing, write_json
 from go1exp.config.schema.registry import Term
 from go1exp.evaluate.statistics import intervals
-from go1exp.evaluate.statistics.intervals import ConditionSummary, Estimate, Interval
+from go1exp.evaluate.statistics.intervals import Estimate, Interval, SummaryEntry
 from go1exp.mdp.measures import measured, per_foot
 from go1exp.mdp.measures.trace import Trace
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from go1exp.sim.env.core import Go1Core
 
 Row = dict[str, Any]
-Summary = Sequence[ConditionSummary]  # of one subject
+Summary = Sequence[SummaryEntry]  # of one subject
 Summaries = Mapping[str, Summary]  # by the subject's label
 Condition = tuple[float | str, ...]  # values of the columns that identify it
 AXES = ("x", "y", "yaw")  # of a command, and its columns: m/s, m/s, rad/s
@@ -105,9 +105,9 @@ def figure(rows: Sequence[Row], column: Column) -> Interval:
     return (intervals.phase_interval if column.how == "phase" else intervals.mean_interval)(each)
 
 
-def summary(rows: Sequence[Row], keys: Sequence[str], columns: Sequence[Column]) -> list[ConditionSummary]:
+def summary(rows: Sequence[Row], keys: Sequence[str], columns: Sequence[Column]) -> list[SummaryEntry]:
     """Return an entry of plain data for each condition: its robots, and every figure with interval and n."""
-    entries: list[ConditionSummary] = []
+    entries: list[SummaryEntry] = []
     for condition, those in by_condition(rows, keys).items():
         figures = {c.name: plain(figure(those, c), c.unit) for c in columns if any(c.name in row for row in those)}
         if FELL.name in figures and MOVING.name in figures:
@@ -159,12 +159,12 @@ def add_measures(rows: Sequence[Row], measures: Mapping[str, np.ndarray | None])
             row |= {k: float(v) if np.isfinite(v) else None for k, v in parts.items()}
 
 
-def described(terms: Sequence[Term], trace: Trace) -> dict[str, Any]:
+def described(terms: Sequence[Term], trace: Trace) -> dict[str, object]:
     """Return the mean over robots of each measure with its 95 % interval and n; lists of four for feet.
 
     A measure whose unit is ``name`` gives the number of robots by name; one that needs what was not recorded, None.
     """
-    report: dict[str, Any] = {}
+    report: dict[str, object] = {}
     by_name = measured(trace, list(terms))
     for term in terms:
         mean = intervals.phase_interval if term.entry.traits.get("circular") else intervals.mean_interval
@@ -307,7 +307,7 @@ def write_rows(file: Path, rows: Sequence[Row], about: dict[str, str]) -> None:
         pq.write_table(table, partial)
 
 
-def finite(value: Any) -> Any:
+def finite(value: object) -> Any:
     """Return plain data for JSON: numbers that are not finite as None, NumPy's as Python's."""
     if isinstance(value, dict):
         return {str(k): finite(v) for k, v in value.items()}

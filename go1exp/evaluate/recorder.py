@@ -135,5 +135,4 @@ def _masses(core: Go1Core) -> NDArray[np.float64]:
     """(N,) mass of each robot as it is simulated, kg."""
     varied = {name for t in core.task.rand for name in t.entry.traits.get("fields", ())} | {*core.plant.effects.fields}
     mass = core.backend.field("body_mass") if "body_mass" in varied else core.backend.compiled("body_mass")
-    total: NDArray[np.float64] = mass.double().sum(-1).expand(core.num_envs).numpy().copy()
-    return total
+    return mass.double().sum(-1).expand(core.num_envs).numpy().copy()

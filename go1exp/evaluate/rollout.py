@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -230,10 +230,10 @@ class _Tally:
         by_figures = {tuple(row): first + i for i, row in reversed(list(enumerate(sums.tolist())))}
         return torch.tensor(sorted(by_figures.values()))
 
-    def _falls(self, robots: torch.Tensor) -> dict[str, Any]:
+    def _falls(self, robots: torch.Tensor) -> dict[str, float | None]:
         return {"count": int(self.fell[robots].sum()), **share(int(self.fell[robots].sum()), len(robots))}
 
-    def _row(self, k: int, command: Command, config: EvalConfig) -> dict[str, Any]:
+    def _row(self, k: int, command: Command, config: EvalConfig) -> dict[str, object]:
         episodes = config.episodes
         robots = slice(k * episodes, (k + 1) * episodes)
         n = float(self.samples[robots].sum())
@@ -276,7 +276,7 @@ def delay_margin(
     task: TaskConfig,
     policy: Policy | None,
     config: EvalConfig,
-    falls: dict[str, Any],
+    falls: Mapping[str, float | None],
     on_step: Callable[[int, int], None] = lambda done, total: None,
     controller: Callable[[], Controller] | None = None,
 ) -> dict[str, Any]:

@@ -14,7 +14,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,7 +30,7 @@ class SolverError(Expected):
     """The solver of quadratic programmes is not installed."""
 
 
-def solver() -> Any:
+def solver() -> ModuleType:
     """Return the module of the solver; raise SolverError if it is not installed."""
     try:
         import daqp

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -189,10 +189,9 @@ CONTROLLERS: dict[str, type] = {"policy": PolicySettings, "mpc": MpcSettings}
 """By their names, which are also the choices of the group ``controller``."""
 
 
-def parse_controller(given: Any) -> MpcSettings | PolicySettings:
+def parse_controller(given: object) -> MpcSettings | PolicySettings:
     """Validate the group ``controller``; raise ConfigError with every problem."""
     if not isinstance(given, Mapping) or given.get("name") not in CONTROLLERS:
         name = given.get("name") if isinstance(given, Mapping) else given
         raise ConfigError([unknown_name("controller.name", str(name), CONTROLLERS, "controller")])
-    checked: MpcSettings | PolicySettings = parse(CONTROLLERS[given["name"]], given, path="controller")
-    return checked
+    return parse(CONTROLLERS[given["name"]], given, path="controller")

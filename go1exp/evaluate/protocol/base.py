@@ -27,7 +27,7 @@ from go1exp.evaluate.controller.types import TrunkVelocity
 from go1exp.evaluate.protocol.claims import Claim
 from go1exp.evaluate.protocol.plan import Array, Constant, Motion, Plan, Velocity
 from go1exp.evaluate.quantities import AXES, FINGERPRINT, LIFE, Column, Derived, Row, add_measures, columns_of, finite
-from go1exp.evaluate.statistics.intervals import ConditionSummary
+from go1exp.evaluate.statistics.intervals import SummaryEntry
 from go1exp.mdp.measures import measured
 from go1exp.mdp.measures.trace import mean_over
 
@@ -133,17 +133,15 @@ class Protocol:
         """Return the approximate number of policy steps times robots."""
         return sum(stage.steps(length.seconds, length.policy_dt) * length.robots for length in self.lengths())
 
-    def drawings(self, played: Played, summary: Sequence[ConditionSummary]) -> list[Drawing]:
+    def drawings(self, played: Played, summary: Sequence[SummaryEntry]) -> list[Drawing]:
         """Return the figures of the report of one subject."""
         return [*self.compared({"": played}, {"": summary}), *self.details(played, summary)]
 
-    def compared(
-        self, plays: Mapping[str, Played], summaries: Mapping[str, Sequence[ConditionSummary]]
-    ) -> list[Drawing]:
+    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Sequence[SummaryEntry]]) -> list[Drawing]:
         """Return the figures that compare subjects, by their labels; the label of a single one is empty."""
         return []
 
-    def details(self, played: Played, summary: Sequence[ConditionSummary]) -> list[Drawing]:
+    def details(self, played: Played, summary: Sequence[SummaryEntry]) -> list[Drawing]:
         """Return the figures that show one subject only."""
         return []
 
@@ -238,7 +236,7 @@ class Steady(Protocol):
     def also(self, motion: Motion, rows: Sequence[Row], settle: int) -> None:
         """Write further figures into the rows; ``settle`` is the step from which they count."""
 
-    def curves(self, motion: Motion, rows: Sequence[Row], settle: int) -> dict[str, Any]:
+    def curves(self, motion: Motion, rows: Sequence[Row], settle: int) -> dict[str, object]:
         """Return plain data for drawings."""
         return {}
 
@@ -265,7 +263,7 @@ class Chosen:
     protocol: Protocol
 
 
-def chosen(given: Any) -> tuple[list[Chosen], bool]:
+def chosen(given: object) -> tuple[list[Chosen], bool]:
     """Return the protocols of the group ``protocol``, and whether the grid is one; raise ConfigError of problems."""
     if not isinstance(given, Mapping) or not given:
         raise ConfigError([f"protocol = {given!r}: choose at least one, such as protocol=sinusoid"])
@@ -282,14 +280,14 @@ def chosen(given: Any) -> tuple[list[Chosen], bool]:
     return selected, GRID in given
 
 
-def kinds(given: Mapping[str, Any]) -> dict[str, type]:
+def kinds(given: Mapping[str, object]) -> dict[str, type]:
     """Return the classes of the protocols of a configuration by their keys there, for the help."""
     names = {key: value.get("term", key) if isinstance(value, Mapping) else key for key, value in given.items()}
     known = members("protocol")
     return {key: cast(type, known[name].target) for key, name in names.items() if name in known}
 
 
-def _one(key: str, value: Any) -> Chosen:
+def _one(key: str, value: object) -> Chosen:
     path = f"protocol.{key}"
     if not isinstance(value, Mapping):
         raise ConfigError([f"{path} = {value!r}: must be a mapping of settings"])

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from go1exp.config.schema.registry import NonNegative
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.statistics.intervals import ConditionSummary, Interval
+from go1exp.evaluate.statistics.intervals import Interval, SummaryEntry
 
 Word = Literal["met", "close", "not met", "inconclusive"]
 
@@ -72,7 +72,7 @@ def verdict(figure: Interval, claim: Claim) -> Word:
 ORDER: tuple[Word, ...] = ("not met", "inconclusive", "close", "met")  # from the worst to the best
 
 
-def evaluated(claims: Mapping[str, Claim], summary: Sequence[ConditionSummary]) -> list[Verdict]:
+def evaluated(claims: Mapping[str, Claim], summary: Sequence[SummaryEntry]) -> list[Verdict]:
     """Return the verdict on each claim in its worst condition of a ``summary``; inconclusive without any condition."""
     verdicts = []
     for name, claim in claims.items():

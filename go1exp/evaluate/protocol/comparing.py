@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,7 +101,7 @@ def _of_all(subject: str, a: Derived, b: Derived, first: Sequence[Row], other: S
 POWER = (1.96 + 0.842) / 1.96  # ratio of a difference to the half-width of its interval at 80 % power
 
 
-def as_json(difference: Difference) -> dict[str, Any]:
+def as_json(difference: Difference) -> dict[str, object]:
     """Return a difference as plain data."""
     fields = {name: value for name, value in vars(difference).items() if name != "unit"}
     return fields | {"difference": plain(difference.difference, difference.unit)}

@@ -8,7 +8,6 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from go1exp.base.files import write_json, write_text
 from go1exp.base.report.page import Page, provenance, render, sections
@@ -19,9 +18,10 @@ from go1exp.evaluate.protocol.comparing import Difference
 from go1exp.evaluate.protocol.ground import UNITS
 from go1exp.evaluate.protocol.playing import Result, as_json
 from go1exp.evaluate.quantities import ROBOT, finite, write_rows
-from go1exp.evaluate.statistics.intervals import ConditionSummary, Estimate
+from go1exp.evaluate.statistics.intervals import Estimate, SummaryEntry
 from go1exp.evaluate.statistics.runs import ORDER as COMPARED
 
+Cells = Sequence[Cell | str]
 Meanings = Mapping[str, str]
 ACROSS = 5  # most columns of quantities in a table, so that it fits on paper
 MANY = 8  # largest number of conditions that are columns; more are rows
@@ -100,12 +100,12 @@ def claims_table(result: Result, means: Meanings) -> Table:
     return Table("Claims", header, rows, VERDICTS if rows else "None.")
 
 
-def figure_tables(entries: Sequence[ConditionSummary], means: Meanings) -> list[Table]:
+def figure_tables(entries: Sequence[SummaryEntry], means: Meanings) -> list[Table]:
     """Return the quantities in tables, one for each set of keys of the conditions.
 
     A row is a quantity and a column a condition; with many conditions, the other way round.
     """
-    groups: dict[tuple[str, ...], list[ConditionSummary]] = {}
+    groups: dict[tuple[str, ...], list[SummaryEntry]] = {}
     for entry in _merged(entries):
         groups.setdefault(tuple(entry["condition"]), []).append(entry)
     tables = []
@@ -124,21 +124,21 @@ def figure_tables(entries: Sequence[ConditionSummary], means: Meanings) -> list[
     return tables
 
 
-def _unit(name: str, entries: Sequence[ConditionSummary]) -> str:
+def _unit(name: str, entries: Sequence[SummaryEntry]) -> str:
     """Return the unit of a quantity in some entries; empty where units differ, as difficulties of grounds do."""
     units = {e["figures"][name]["unit"] for e in entries if name in e["figures"]}
     return units.pop() if len(units) == 1 else ""
 
 
-def _merged(entries: Sequence[ConditionSummary]) -> list[ConditionSummary]:
-    merged: dict[tuple[tuple[str, float | str], ...], ConditionSummary] = {}
+def _merged(entries: Sequence[SummaryEntry]) -> list[SummaryEntry]:
+    merged: dict[tuple[tuple[str, float | str], ...], SummaryEntry] = {}
     for entry in entries:
         one = merged.setdefault(tuple(entry["condition"].items()), {**entry, "figures": {}})
         one["figures"] |= entry["figures"]
     return list(merged.values())
 
 
-def _names(entries: Sequence[ConditionSummary]) -> list[str]:
+def _names(entries: Sequence[SummaryEntry]) -> list[str]:
     """Return the quantities of some entries: falls first, without time in motion and without an unused ``left_map``."""
     names = dict.fromkeys(name for e in entries for name in e["figures"])
     names.pop("moving_s", None)
@@ -149,12 +149,7 @@ def _names(entries: Sequence[ConditionSummary]) -> list[str]:
 
 
 def _split(
-    title: str,
-    corner: str,
-    rows: Sequence[Cell | str],
-    columns: Sequence[str],
-    cells: Sequence[Sequence[Cell | str]],
-    notes: Sequence[str] = (),
+    title: str, corner: str, rows: Cells, columns: Sequence[str], cells: Sequence[Cells], notes: Sequence[str] = ()
 ) -> list[Table]:
     """Return tables of at most ``ACROSS`` equally many columns beside the first, without rows that are empty."""
     wide = math.ceil(len(columns) / math.ceil(len(columns) / ACROSS))
@@ -241,7 +236,7 @@ def write(result: Result, folder: Path) -> list[Path]:
 
 
 def comparison(
-    plays: Mapping[str, Sequence[Result]], differences: Mapping[str, Sequence[Difference]], about: Mapping[str, Any]
+    plays: Mapping[str, Sequence[Result]], differences: Mapping[str, Sequence[Difference]], about: Mapping[str, object]
 ) -> str:
     """Return the page of a comparison."""
     tables, drawings = [_counts(differences)], []

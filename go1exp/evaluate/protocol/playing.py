@@ -5,9 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from go1exp import __version__
 from go1exp.base import memory
@@ -18,7 +17,7 @@ from go1exp.evaluate.protocol.base import Chosen, Length, Played, Protocol
 from go1exp.evaluate.protocol.claims import Verdict, evaluated
 from go1exp.evaluate.protocol.stage import Rates, Setting, Stage
 from go1exp.evaluate.quantities import ROBOT, Derived, Row, about, by_condition, coarse_note, distinct, plain, summary
-from go1exp.evaluate.statistics.intervals import ConditionSummary, Interval, bootstrap_interval
+from go1exp.evaluate.statistics.intervals import Interval, SummaryEntry, bootstrap_interval
 
 
 @dataclass
@@ -27,15 +26,15 @@ class Result:
 
     chosen: Chosen  # the protocol
     label: str  # name of the agent
-    about: dict[str, Any]  # origin of the agent, robot, seed and rates: plain data
+    about: dict[str, object]  # origin of the agent, robot, seed and rates: plain data
     played: Played  # rows without repeats, curves, notes
     repeats: int  # number of rows that repeated another one and do not count
-    summary: list[ConditionSummary]  # figures with n and interval, by condition
+    summary: list[SummaryEntry]  # figures with n and interval, by condition
     verdicts: list[Verdict]  # of its claims
     seconds: float  # what it took, s
 
 
-def as_json(result: Result) -> dict[str, Any]:
+def as_json(result: Result) -> dict[str, object]:
     """Return a result as plain data, without its rows."""
     verdicts = [
         {
@@ -67,7 +66,7 @@ def play(
     chosen: Chosen,
     agent: Agent,
     rates: Rates,
-    origin: dict[str, Any] | None = None,
+    origin: Mapping[str, object] | None = None,
     on_step: Progress = lambda done, total: None,
 ) -> Result:
     """Play a protocol, evaluate its claims; ``origin`` is for the report; raise ConfigError of a wrong length first."""
@@ -98,7 +97,7 @@ def _stage(protocol: Protocol, agent: Agent, rates: Rates, on_step: Progress = l
     return Stage(agent, Setting(**vars(rates), noise=noise, randomize=randomize, trunk_velocity=velocity), on_step)
 
 
-def summarised(chosen: Chosen, rows: Sequence[Row]) -> list[ConditionSummary]:
+def summarised(chosen: Chosen, rows: Sequence[Row]) -> list[SummaryEntry]:
     """Return every figure of a protocol's rows with n and interval: by condition, then those of all robots together."""
     protocol = chosen.protocol
     entries = summary(rows, protocol.keys, protocol.columns())

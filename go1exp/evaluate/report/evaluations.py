@@ -29,7 +29,7 @@ class RunRows:
     """The rows of one run."""
 
     table: dict[str, np.ndarray]  # columns (n,) by name
-    settings: dict[str, Any]  # of the evaluation, plain data; only equal ones are compared
+    settings: dict[str, object]  # of the evaluation, plain data; only equal ones are compared
     keys: tuple[str, ...]  # columns with the condition and the robot of a row
     protocol: Protocol | None  # None for the grid
 
@@ -48,7 +48,7 @@ class Evaluation:
     columns: tuple[Column, ...]
     main: tuple[str, ...]  # names of the compared quantities
     runs: dict[Path, RunRows] = field(default_factory=dict)  # rows by run folder
-    settings: dict[str, Any] = field(default_factory=dict)
+    settings: dict[str, object] = field(default_factory=dict)
 
 
 def names(run: Run) -> list[str]:
@@ -136,7 +136,7 @@ def _read(name: str, file: Path) -> RunRows:
     return RunRows(table, settings, tuple(key for key in (*protocol.keys, ROBOT) if key in table), protocol)
 
 
-def _settings(name: str, about: Mapping[str, Any]) -> dict[str, Any]:
+def _settings(name: str, about: Mapping[str, Any]) -> dict[str, object]:
     if name == GRID:
         commands = [entry["command"] for entry in about["commands"]]
         return {**about["settings"], "robot": about.get("robot", {}), "commands": commands}

@@ -70,7 +70,7 @@ class Group:
     """Runs that differ in their seed alone."""
 
     name: str
-    settings: dict[str, Any]  # keys in which groups differ, with this group's values; "-" for a missing key
+    settings: dict[str, object]  # keys in which groups differ, with this group's values; "-" for a missing key
     runs: list[Run]
 
 
@@ -178,7 +178,7 @@ def _included(runs: Sequence[Run], absent: list[Absent], notes: list[str], unfin
 def groups(study: Study) -> list[Group]:
     """Return the groups of a study in the order of their settings; repeated runs are excluded."""
     entries: dict[str, list[Run]] = {}
-    settings: dict[str, dict[str, Any]] = {}
+    settings: dict[str, dict[str, object]] = {}
     for run in study.runs:
         values = _flat(run.config)
         key = json.dumps(values, sort_keys=True, default=str)
@@ -223,9 +223,9 @@ def _has(group: Group, wanted: str) -> bool:
     )
 
 
-def _flat(config: Mapping[str, Any], path: str = "") -> dict[str, Any]:
+def _flat(config: Mapping[str, object], path: str = "") -> dict[str, object]:
     """Return every value of nested mappings by its path, without keys that do not change training; lists are values."""
-    values: dict[str, Any] = {}
+    values: dict[str, object] = {}
     for key, value in config.items():
         name = f"{path}.{key}" if path else str(key)
         if name in WITHOUT:

@@ -35,8 +35,8 @@ class Estimate(TypedDict):
     unit: str
 
 
-class ConditionSummary(TypedDict):
-    """The figures of the robots of one condition, by name."""
+class SummaryEntry(TypedDict):
+    """An entry of a summary: the figures of the robots of one condition, by name."""
 
     condition: dict[str, Any]
     n: int

@@ -16,15 +16,9 @@ import urllib.parse
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from http.cookies import CookieError, SimpleCookie
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from go1exp.base.errors import Expected
-
-if TYPE_CHECKING:
-    from websockets.http11 import Response
-
-    Answer = Response | None
-    Handler = Callable[..., Coroutine[None, None, Answer]]
 
 FIRST_PORT, PORTS = 8080, 20  # first port and number of ports of the search for a free one
 REFUSAL = "go1exp: open the address that the command printed; without the token in it nothing is shown\n"
@@ -56,10 +50,10 @@ class Gate:
         given = [*query.get("token", ()), *([kept.value] if kept else ())]
         return any(secrets.compare_digest(word.encode(), self.token.encode()) for word in given)
 
-    def guarded(self, process: Callable[..., Awaitable[Answer] | Answer]) -> Handler:
+    def guarded(self, process: Callable[..., Awaitable[Any] | Any]) -> Callable[..., Coroutine[Any, Any, Any]]:
         """Return a ``process_request`` of a server of the package ``websockets`` that answers 403 to the others."""
 
-        async def process_request(connection: Any, request: Any) -> Answer:
+        async def process_request(connection: Any, request: Any) -> Any:
             headers = request.headers
             if any(len(headers.get_all(name)) > 1 for name in ("Host", "Origin")):
                 return connection.respond(http.HTTPStatus.BAD_REQUEST, "go1exp: one Host and one Origin at most\n")
@@ -184,10 +178,10 @@ class Gamepad:
         )
         return pushed if any(pushed) else None
 
-    def served(self, process: Callable[..., Awaitable[Answer] | Answer]) -> Handler:
+    def served(self, process: Callable[..., Awaitable[Any] | Any]) -> Callable[..., Coroutine[Any, Any, Any]]:
         """Return a ``process_request`` as in ``gate`` that hears the script, and adds it to the page."""
 
-        async def process_request(connection: Any, request: Any) -> Answer:
+        async def process_request(connection: Any, request: Any) -> Any:
             parts = urllib.parse.urlsplit(request.path)
             if parts.path == PATH:
                 known = self.hear(parts.query)

@@ -154,8 +154,7 @@ def resized(term: Term, size: float, contact: ContactConfig) -> Term:
 
 def params_of(term: Term) -> tuple[Param, ...]:
     """Return the declarations of an effect's parameters."""
-    declared: tuple[Param, ...] = vars(term.entry.target)["params"]
-    return declared
+    return vars(term.entry.target)["params"]
 
 
 def _scaled(value: JointValues, param: Param, size: float) -> JointValues:

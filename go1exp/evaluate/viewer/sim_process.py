@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -214,7 +214,7 @@ class RobotProcess:
 
     def __init__(
         self,
-        groups: Mapping[str, Any],
+        groups: Mapping[str, object],
         tile: tuple[int, int],
         config: SimConfig,
         address: tuple[str, int],
@@ -278,7 +278,7 @@ class RobotProcess:
 
 def _run(
     pipe: Connection,
-    groups: dict[str, Any],
+    groups: dict[str, object],
     tile: tuple[int, int],
     config: SimConfig,
     address: tuple[str, int],

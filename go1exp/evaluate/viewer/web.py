@@ -71,14 +71,14 @@ LAG_S = 0.1  # delay behind real time from which it is not made up, s
 class Ask(messages.Event):
     """From the window to the loop: a request of the user."""
 
-    request: Any
+    request: object
 
 
 @dataclass(frozen=True)
 class Shown(messages.Snapshot):
     """From the loop to the window: the content of the panels. Only the newest one is drawn."""
 
-    view: Any
+    view: object
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -14,9 +14,6 @@ from go1exp.sim.env.batch import make, task_of, whole
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.sb3_env import action_tensor, spaces
 from go1exp.sim.task import TaskConfig
-
-if TYPE_CHECKING:
-    from go1exp.sim.env.camera import Camera
 
 ACTION_BOX = 2.0
 """Default bound of the action space, in units of ``action.scale``: 0.4 rad about the nominal stance by default.
@@ -68,7 +65,7 @@ class Go1Env(gym.Env[np.ndarray, np.ndarray]):
         self.observation_space, self.action_space = spaces(self.core, action_box)
         self.metadata = {**self.metadata, "render_fps": round(1.0 / task.sim.policy_dt)}
         self.render_mode = render_mode
-        self._camera: Camera | None = None
+        self._camera: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """Start an episode; a seed makes it and all that follow reproducible."""

@@ -8,7 +8,7 @@ Where another link of the leg touches too, or dry friction or a stop acts on a j
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -16,9 +16,6 @@ import numpy as np
 from go1exp import robot
 from go1exp.sim.physics.physx_robot import pair_friction
 from go1exp.sim.physics.scene import CONTACT_LINKS, FLOOR
-
-if TYPE_CHECKING:
-    from sapien.physx import PhysxCollisionShape, PhysxContact
 
 ROUNDING = 1e-4
 """Depth of a contact, m, beyond which it is one although it bears nothing: its body is pushed out at another point."""
@@ -42,7 +39,7 @@ class Contacts:
         self._foot = {model.geom(name).id: k for k, name in enumerate(robot.FEET)}
         self._links = [model.body(name).id for name in CONTACT_LINKS]
 
-    def read(self, env: int, contacts: list[PhysxContact], shapes: dict[PhysxCollisionShape, int]) -> None:
+    def read(self, env: int, contacts: list[Any], shapes: dict[Any, int]) -> None:
         """Take in the contacts of one robot's last step; ``shapes`` gives the geom of each collision shape."""
         self.body_points[env] = self.foot_points[env] = self.foot_force[env] = 0.0
         for contact in contacts:

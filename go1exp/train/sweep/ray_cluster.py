@@ -13,8 +13,7 @@ import socket
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -23,9 +22,6 @@ from go1exp.config.schema.registry import ConfigError, Count, CountOrZero
 from go1exp.config.schema.settings import settings
 from go1exp.train.sweep import command
 from go1exp.train.sweep.command import Ended, Task, Watch
-
-if TYPE_CHECKING:
-    from ray import ObjectRef
 
 
 @settings
@@ -114,7 +110,7 @@ class Ray:
         cloudpickle.register_pickle_by_value(command)  # the workers of a cluster need not find this package
         self._fits(ray)
 
-    def _fits(self, ray: ModuleType) -> None:
+    def _fits(self, ray: Any) -> None:
         """Refuse jobs that no node could ever run: they would wait for ever."""
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         wanted = {"CPU": float(self.settings.cpus), "GPU": self.settings.gpus}
@@ -144,7 +140,7 @@ def _refuse_silence(address: str | None) -> None:
         raise Expected(f"ray: no cluster at {address!r} ({why}); hydra.launcher.address=null starts one here") from None
 
 
-def _follow(ray: ModuleType, tasks: dict[ObjectRef, Task], watch: Watch) -> None:
+def _follow(ray: Any, tasks: dict[Any, Task], watch: Watch) -> None:
     """Tell of each task when it ends, and now and then of those that have begun.
 
     Raises:
@@ -158,7 +154,7 @@ def _follow(ray: ModuleType, tasks: dict[ObjectRef, Task], watch: Watch) -> None
         watch.changed()
 
 
-def _stop(ray: ModuleType, references: list[ObjectRef]) -> None:
+def _stop(ray: Any, references: list[Any]) -> None:
     """Have the tasks end with a checkpoint, and wait for that."""
     print("\nstopping the jobs after the iteration under way, with a checkpoint", file=sys.stderr, flush=True)
     for reference in references:
@@ -166,7 +162,7 @@ def _stop(ray: ModuleType, references: list[ObjectRef]) -> None:
     ray.wait(references, num_returns=len(references), timeout=STOP_S)
 
 
-def _result(ray: ModuleType, reference: ObjectRef) -> Ended:
+def _result(ray: Any, reference: Any) -> Ended:
     try:
         how: Ended = ray.get(reference)
     except Exception as error:  # Ray's own: the node died too often, the task was cancelled

@@ -18,7 +18,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -27,9 +27,6 @@ from go1exp.base.files import write_json
 from go1exp.config.schema.registry import ConfigError, Count, CountOrZero
 from go1exp.config.schema.settings import settings
 from go1exp.train.sweep.command import Command, Ended, Running, Task, Watch
-
-if TYPE_CHECKING:
-    from submitit.helpers import DelayedSubmission
 
 
 @settings
@@ -100,7 +97,7 @@ class SlurmJob:
         print(f"status {how.status}: {how.last_line}", flush=True)
         return how
 
-    def checkpoint(self) -> DelayedSubmission:
+    def checkpoint(self) -> Any:
         """Have the training save a checkpoint and end; return what runs when the job starts again."""
         from submitit.helpers import DelayedSubmission
 

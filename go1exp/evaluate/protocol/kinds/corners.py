@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +42,7 @@ class Corners(Steady):
             along = motion.velocity[:, n] @ command / (command @ command)
             row |= step_answer(along, step, settle, motion.dt)
 
-    def curves(self, motion: Motion, rows: Sequence[Row], settle: int) -> dict[str, Any]:
+    def curves(self, motion: Motion, rows: Sequence[Row], settle: int) -> dict[str, object]:
         """Return the mean velocity along each command, as a share of the command, over time."""
         shares = {}
         for k, command in enumerate(self.commands):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +53,7 @@ class Energy(Steady):
         assert motion.trace is not None
         add_measures(rows, effort(motion.trace))
 
-    def curves(self, motion: Motion, rows: Sequence[Row], settle: int) -> dict[str, Any]:
+    def curves(self, motion: Motion, rows: Sequence[Row], settle: int) -> dict[str, object]:
         """Return torque and speed of some joints at some instants, by kind of joint."""
         trace = motion.trace
         assert trace is not None

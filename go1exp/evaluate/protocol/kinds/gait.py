@@ -14,7 +14,7 @@ from go1exp.config.schema.registry import protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import ERRORS, Played, Steady, by_axis, command_text, rounded
 from go1exp.evaluate.protocol.plan import Motion
-from go1exp.evaluate.quantities import Column, ConditionSummary, Row, Summaries, Summary
+from go1exp.evaluate.quantities import Column, Row, Summaries, Summary, SummaryEntry
 from go1exp.mdp.measures.gait import touchdown_phase
 from go1exp.mdp.measures.trace import find_runs
 
@@ -45,7 +45,7 @@ class Gait(Steady):
             duty = [row.get(f"duty_factor_{leg}") for leg in robot.LEGS]
             row["symmetry"] = _asymmetry(duty)
 
-    def curves(self, motion: Motion, rows: Sequence[Row], settle: int) -> dict[str, Any]:
+    def curves(self, motion: Motion, rows: Sequence[Row], settle: int) -> dict[str, object]:
         """Return stances of the first robot of each command, and the phases of all."""
         trace = motion.trace
         assert trace is not None
@@ -149,7 +149,7 @@ def _over_speed(summaries: Summaries) -> plots.Figure:
     return figure
 
 
-def straight(summary: Summary) -> tuple[list[float], list[ConditionSummary]]:
+def straight(summary: Summary) -> tuple[list[float], list[SummaryEntry]]:
     """Return the conditions whose command is straight ahead or back, by rising velocity, m/s; the velocities first."""
     ahead = [e for e in summary if "x" in e["condition"] and not any(e["condition"].get(k) for k in ("y", "yaw"))]
     ahead.sort(key=lambda e: e["condition"]["x"])

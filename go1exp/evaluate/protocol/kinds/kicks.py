@@ -167,7 +167,7 @@ class Kicks(Protocol):
         later = np.flatnonzero(held[left:]) if left < len(held) else np.array([])
         return round(float((later[0] + left) * dt), 4) if len(later) else None
 
-    def _run(self, motion: Motion) -> dict[str, Any]:
+    def _run(self, motion: Motion) -> dict[str, object]:
         """Return one robot's whole run, of one that stays up if there is any."""
         up = np.flatnonzero(motion.alive[-1])
         n = int(up[0]) if len(up) else 0
@@ -183,7 +183,7 @@ class Kicks(Protocol):
         """(N,) direction of the force on each robot, from its heading counter-clockwise, rad."""
         return np.where(np.arange(self.robots) % 2, np.pi, 0.0) + np.radians(self.direction_deg)
 
-    def _after(self, motion: Motion, k: int) -> dict[str, Any]:
+    def _after(self, motion: Motion, k: int) -> dict[str, object]:
         """Return height, and velocity to the pushed side, around one kick, of the robots that are up before it."""
         starts, dt = self.starts()[:, k], motion.dt
         steps = np.arange(-round(1.0 / dt), round((self.every_s - 0.5) / dt))

@@ -210,11 +210,8 @@ def _map(summaries: Summaries) -> plots.Figure:
                 continue
             angle = np.array([a for a, _ in shown] + [shown[0][0] + 2 * np.pi])
             closed = [f for _, f in shown] + [shown[0][1]]
-            middle = [f["estimate"] for f in closed]
-            low, high = (
-                [m if bound is None else bound for m, bound in zip(middle, bounds, strict=True)]
-                for bounds in ([f["low"] for f in closed], [f["high"] for f in closed])
-            )
+            points = np.array([(f["estimate"], f["low"], f["high"]) for f in closed], dtype=np.float64)
+            middle, low, high = np.where(np.isnan(points), points[:, :1], points).T
             text = {"impulse_median": "median", "impulse_p10": "10th percentile"}[name]
             ax.plot(angle, middle, style, color=plots.COLOURS[k], lw=1.4, label=f"{who} {text}".strip())
             if style == "-":

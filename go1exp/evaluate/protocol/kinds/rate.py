@@ -7,7 +7,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from go1exp.base.report import plots
@@ -15,7 +14,7 @@ from go1exp.config.schema.registry import NonNegative, Positive, protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.controller.types import TrunkVelocity
 from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, lives, repeated
-from go1exp.evaluate.protocol.plan import Motion, Plan, Signal
+from go1exp.evaluate.protocol.plan import Array, Motion, Plan, Signal
 from go1exp.evaluate.quantities import Column, Derived, Row, Summaries, values
 
 if TYPE_CHECKING:
@@ -134,7 +133,7 @@ class Rate(Protocol):
         return [plots.Drawing("rate", "Error, falls and effort over the rate", text, partial(_over_rate, summaries))]
 
 
-def _rms(values: NDArray[np.float64]) -> float:
+def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -122,7 +122,7 @@ def label(sine: Sine) -> str:
     return " ".join(f"{v:g}" for v in sine.amplitude)
 
 
-def _curve(motion: Motion, robots: slice) -> dict[str, Any]:
+def _curve(motion: Motion, robots: slice) -> dict[str, object]:
     """Return the velocities of some robots for a drawing; of robots while they are up."""
     up = motion.alive[::EVERY, robots, None]
     velocity = np.where(up, motion.velocity[::EVERY, robots], np.nan)
