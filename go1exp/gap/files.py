@@ -65,8 +65,7 @@ def load(folder: Path) -> GapResult:
 
 def from_dict(plain: Mapping[str, Any]) -> GapResult:
     """Turn what ``GapResult.as_dict`` returned, and JSON kept, into a result; None is NaN where a number belongs."""
-    result: GapResult = _read(GapResult, plain, "")
-    return result
+    return _read(GapResult, plain, "")
 
 
 def search_of(result: GapResult) -> GapSettings:

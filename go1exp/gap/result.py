@@ -318,7 +318,7 @@ class GapResult:
         return {"exit_code": self.exit_code, **{name: _plain(value) for name, value in plain.items()}}
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, dict):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,9 +18,6 @@ from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.effects.base import Measured
 from go1exp.sim.env.plant import FRICTION, Plant
 from go1exp.sim.physics.backend import PhysicsBackend
-
-if TYPE_CHECKING:
-    from go1exp.gap.replay.walking import ImuRecorder
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)  # attitude of a trunk that is held level, w-x-y-z
 
@@ -130,7 +127,7 @@ class Replayer:
         """Return a replayer of the same windows with other quantities (``Windows.observable``): with torques."""
         return Replayer(self.machine, windows, self.quats, self.max_rows, self.threads)
 
-    def _recorder(self, steps: int, rows: int) -> ImuRecorder | None:
+    def _recorder(self, steps: int, rows: int) -> Any:
         """Return what records more than the joints, or None."""
         return None
 

@@ -6,7 +6,7 @@ import dataclasses
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, ClassVar, Literal, TypeVar
 
 import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
@@ -168,7 +168,7 @@ def _joint_problems(config: ModelConfig) -> list[str]:
     return wrong
 
 
-def parse_model(settings: Any, path: str = "model") -> ModelConfig | Go1Model:
+def parse_model(settings: object, path: str = "model") -> ModelConfig | Go1Model:
     """Validate a choice of ``conf/model``; the Go1's ``mjcf`` is null.
 
     A relative path of a MuJoCo file counts from the project's root. The file itself is not opened here. ConfigError
@@ -188,7 +188,7 @@ def parse_model(settings: Any, path: str = "model") -> ModelConfig | Go1Model:
 Kind = TypeVar("Kind", ModelConfig, Go1Model)
 
 
-def _checked(kind: type[Kind], settings: Mapping[str, Any], path: str) -> Kind:
+def _checked(kind: type[Kind], settings: Mapping[str, object], path: str) -> Kind:
     try:
         return TypeAdapter(kind).validate_json(as_json(dict(settings)))
     except ValidationError as error:

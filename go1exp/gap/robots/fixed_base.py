@@ -11,9 +11,8 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-import mujoco
 import numpy as np
 import torch
 from torch import Tensor
@@ -97,7 +96,7 @@ class FixedBase:
         model = self.model(0.001, (1.0, 0.0, 0.0, 0.0))
         return np.where(model.jnt_limited[:, None], model.jnt_range, np.nan)
 
-    def model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool = False) -> mujoco.MjModel:
+    def model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool = False) -> Any:
         """Return the compiled MuJoCo model; the base of one that is ``mounted`` can move."""
         file, base = Path(self.config.mjcf), self.config.base
         return build_fixed_base(file, base, self.joints, self.effort, physics_dt, base_quat, mounted)

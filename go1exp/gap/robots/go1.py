@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, cast
+from typing import Any, ClassVar, cast
 
-import mujoco
 import numpy as np
 
 from go1exp import robot
@@ -116,7 +115,7 @@ class Go1:
         backend = MujocoCpu(model, blocks, num, threads)
         return backend, actuator_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
 
-    def _model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool) -> tuple[mujoco.MjModel, Sensors]:
+    def _model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool) -> tuple[Any, Sensors]:
         raise NotImplementedError
 
 
@@ -130,7 +129,7 @@ class StandingGo1(Go1):
     contact: ContactConfig = MUJOCO_CONTACT
     held: Machine = field(kw_only=True)
 
-    def _model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool) -> tuple[mujoco.MjModel, Sensors]:
+    def _model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool) -> tuple[Any, Sensors]:
         ground = build_terrain(TerrainConfig(kind="flat"))
         model, blocks = build_model(self.config, ground, physics_dt, contact=self.contact)
         model.opt.disableflags |= NO_SENSORS
@@ -160,7 +159,7 @@ class SwingingGo1(Go1):
 
     base_probe: tuple[float, ...] = IMU_PROBE
 
-    def _model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool) -> tuple[mujoco.MjModel, Sensors]:
+    def _model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool) -> tuple[Any, Sensors]:
         model, blocks = build_model(self.config, None, physics_dt)
         weigh_down(model, HEAVY)
         return model, blocks
@@ -196,7 +195,7 @@ class SuspendedGo1(Go1):
         """Lowest and highest angle (J, 2), rad."""
         return robot.JOINT_POS_LIMITS.copy()
 
-    def _model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool) -> tuple[mujoco.MjModel, Sensors]:
+    def _model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool) -> tuple[Any, Sensors]:
         w, x, y, z = base_quat
         return build_model(self.config, None, physics_dt, held=(w, x, y, z), mounted=mounted)
 

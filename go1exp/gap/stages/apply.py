@@ -144,13 +144,12 @@ def _provenance(result: GapResult) -> list[str]:
 # ---------------------------------------------------------------------- the proof
 
 
-def terms_of(plain: Mapping[str, Any]) -> tuple[Term, ...]:
+def terms_of(plain: Mapping[str, object]) -> tuple[Term, ...]:
     """Return the effects of a file's content, as training reads them; ValueError if training would refuse it."""
     parts, problems = parse_parts({"effect": plain}, ("effect",))
     if problems:
         raise ValueError("\n".join(problems))
-    terms: tuple[Term, ...] = parts["effect"]
-    return terms
+    return parts["effect"]
 
 
 def composed(*contents: Mapping[str, Any]) -> dict[str, Any]:

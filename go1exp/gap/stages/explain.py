@@ -207,7 +207,7 @@ def _angle_errors(comparison: Comparison, search: Search) -> AngleErrors:
 
 def provenance(
     comparison: Comparison, search: Search, logs: Sequence[Recording], settings: GapSettings
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return hashes of the logs, versions, the user's settings, and which episodes were for what."""
     recordings, episode, parts = comparison.recordings, comparison.windows.episode, search.splits
     kinds = {"train": parts.train, "select": parts.select, "confirm": parts.confirm}

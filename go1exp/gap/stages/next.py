@@ -72,7 +72,7 @@ class NextResult:
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain values that JSON can hold."""
-        design: dict[str, Any] | None = None
+        design: dict[str, object] | None = None
         if self.best:
             gains = {"kp": self.best.kp.tolist(), "kd": self.best.kd.tolist()}
             design = {**self.best.design.about(self.rate_hz), **gains, "used_of_limits": asdict(self.best.used)}
