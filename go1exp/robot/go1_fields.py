@@ -6,7 +6,7 @@ exchanging packets with it.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -109,7 +109,7 @@ _END = (Field("remote", "(40,)u1", "the handheld controller's bytes", SDK), Fiel
 _CRC = (Field("crc", "<u4", "checksum of the words before it", TRIED),)
 
 
-def dtype_of(fields: tuple[Field, ...], **parts: tuple[np.dtype[Any], tuple[int, ...]]) -> np.dtype[Any]:
+def dtype_of(fields: tuple[Field, ...], **parts: tuple[np.dtype[np.void], tuple[int, ...]]) -> np.dtype[np.void]:
     """Return the packed type of ``fields``, in which ``parts`` gives the type and shape of nested ones."""
     return np.dtype([(f.name, *parts[f.name]) if f.name in parts else (f.name, f.kind) for f in fields])
 

@@ -263,7 +263,7 @@ def _terms(group: str, settings: object) -> tuple[tuple[Term, ...], list[str]]:
     return tuple(term for term, _ in bound if term), [p for _, problems in bound for p in problems]
 
 
-def parse_parts(container: Mapping[str, Any], wanted: tuple[str, ...]) -> tuple[dict[str, Any], list[str]]:
+def parse_parts(container: Mapping[str, object], wanted: tuple[str, ...]) -> tuple[dict[str, Any], list[str]]:
     """Validate the named parts of a composed configuration; return them by name, and the problems."""
     parts: dict[str, Any] = {}
     problems: list[str] = []
@@ -293,7 +293,7 @@ def parse_parts(container: Mapping[str, Any], wanted: tuple[str, ...]) -> tuple[
     return parts, problems
 
 
-def required_parts(container: Mapping[str, Any]) -> dict[str, Any]:
+def required_parts(container: Mapping[str, object]) -> dict[str, Any]:
     """Return every part of a configuration by name; raise ConfigError with every problem."""
     parts, problems = parse_parts(container, tuple(container))
     if problems:
@@ -363,7 +363,7 @@ def _cross_rules(parts: Mapping[str, Any]) -> list[str]:
     return problems + _randomization_rules(parts.get("rand") or ())
 
 
-def parse_task(container: Mapping[str, Any]) -> TaskConfig:
+def parse_task(container: Mapping[str, object]) -> TaskConfig:
     """Load the plugins of a composed configuration, validate its task; raise ConfigError with every problem."""
     plugins.use(container.get(plugins.KEY))
     wanted = tuple(f.name for f in fields(TaskConfig))
@@ -374,7 +374,7 @@ def parse_task(container: Mapping[str, Any]) -> TaskConfig:
     return TaskConfig(**parts)
 
 
-def parse_train(container: Mapping[str, Any]) -> TrainConfig:
+def parse_train(container: Mapping[str, object]) -> TrainConfig:
     """Load the plugins of a training configuration and validate it; raise ConfigError with every problem."""
     plugins.use(container.get(plugins.KEY))
     task_names = tuple(f.name for f in fields(TaskConfig))

@@ -5,10 +5,8 @@ A stride of a foot lasts from one touchdown to the next. At zero command a robot
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from go1exp import robot
 from go1exp.config.schema.registry import Fraction, measure
@@ -32,7 +30,7 @@ WALK_DUTY = 0.5
 """A gait of four beats whose feet are on the ground for more than this share of the time is a walk, else an amble."""
 
 
-def distance(a: Array, b: Any) -> Array:
+def distance(a: Array, b: ArrayLike) -> Array:
     """Return the distance of two phases around the circle, in cycles, 0 to 0.5."""
     return np.abs((a - np.asarray(b) + 0.5) % 1.0 - 0.5)
 

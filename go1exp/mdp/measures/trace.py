@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,7 +87,7 @@ def largest_within(
     return np.maximum.reduceat(flat, bounds)[::2] if len(bounds) else np.zeros(0)
 
 
-Array = NDArray[np.floating[Any]]
+Array = NDArray[np.floating]
 
 LEAST_PHASE = 0.01
 """Stances and swings shorter than this are taken for bounces, s: half of a policy step (chosen)."""
@@ -112,7 +111,7 @@ class Trace:
     """Time between two samples of ``contact``, s."""
     counts: NDArray[np.bool_]
     """(T, N) steps that count: not while settling, not after a fall."""
-    mass: NDArray[np.floating[Any]] | None = None
+    mass: NDArray[np.floating] | None = None
     """(N,) of the robot with its load, kg."""
     command: Array | None = None
     """(T, N, 3) commanded velocity: x, y in m/s, yaw rate in rad/s, body frame."""
@@ -229,7 +228,7 @@ class Trace:
     def _least(self) -> int:
         return round(LEAST_PHASE / self.contact_dt)
 
-    def _by_foot(self, samples: NDArray[Any]) -> NDArray[np.int8]:
+    def _by_foot(self, samples: np.ndarray) -> NDArray[np.int8]:
         """Turn (S, N, 4) into (4 N, S)."""
         return np.ascontiguousarray(np.moveaxis(samples.astype(np.int8), 0, -1)).reshape(-1, len(samples))
 
@@ -266,7 +265,7 @@ def percentile_by_robot(values: Array, robots: NDArray[np.intp], count: int, per
     return result
 
 
-def ratio(numerator: NDArray[Any], denominator: NDArray[Any]) -> Array:
+def ratio(numerator: np.ndarray, denominator: np.ndarray) -> Array:
     """Return the quotient, NaN where the denominator is not positive."""
     out = np.full(np.broadcast(numerator, denominator).shape, np.nan)
     return np.divide(numerator, denominator, out=out, where=np.asarray(denominator) > 0)

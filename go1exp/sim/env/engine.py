@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, TypeVar
 
-import mujoco
 import torch
 from torch import Tensor
 
@@ -32,7 +31,7 @@ FLOAT_BYTES = 4
 DEGREES_OF_FREEDOM = 6 + robot.NUM_JOINTS
 
 
-def make_backend(config: BackendConfig, model: mujoco.MjModel, sensors: Sensors, num_envs: int) -> PhysicsBackend:
+def make_backend(config: BackendConfig, model: Any, sensors: Sensors, num_envs: int) -> PhysicsBackend:
     """Build the physics engine that the configuration names.
 
     Raises:
