@@ -227,7 +227,7 @@ class SharedNoise(DiagGaussianDistribution):
         return spread.mean + spread.stddev * noise
 
 
-Work = Callable[[dict[str, Any], Path, Group], object]
+Work = Callable[[dict[str, object], Path, Group], object]
 """What a member does: with the configuration as plain data, the run folder and its group."""
 
 ENDED_EARLY = "a process of another GPU ended early"
@@ -241,7 +241,7 @@ class MemberEnded(Expected):
 
 
 @contextmanager
-def together(size: int, work: Work, container: dict[str, Any], run: Path, backend: str = "nccl") -> Iterator[Group]:
+def together(size: int, work: Work, container: dict[str, object], run: Path, backend: str = "nccl") -> Iterator[Group]:
     """Start ``size`` - 1 other processes that do ``work``, and be the first member of their group.
 
     Should one of them fail, this process ends at once where it would wait for it for ever.
@@ -304,7 +304,7 @@ def _start(others: Sequence[BaseProcess]) -> None:
 
 
 def _member(
-    rank: int, size: int, meeting: Path, backend: str, work: Work, container: dict[str, Any], run: Path
+    rank: int, size: int, meeting: Path, backend: str, work: Work, container: dict[str, object], run: Path
 ) -> None:
     """Do ``work`` as member ``rank``; the first member handles signals for all."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):

@@ -62,7 +62,7 @@ class WandbWriter(KVWriter):
     Its name is the run folder's, its group the sweep's, unless settings or environment have others.
     """
 
-    def __init__(self, run: Path, config: WandbConfig, settings: dict[str, Any]) -> None:
+    def __init__(self, run: Path, config: WandbConfig, settings: dict[str, object]) -> None:
         wandb = _wandb()
         identity = run / IDENTITY
         if not identity.exists():
@@ -142,7 +142,7 @@ def _bundle(run: Path) -> Path | None:
     return run / BUNDLE
 
 
-def _table(rows: Sequence[Mapping[str, Any]]) -> Any:
+def _table(rows: Sequence[Mapping[str, object]]) -> Any:
     columns = list(dict.fromkeys(name for row in rows for name in row))
     return _wandb().Table(columns=columns, data=[[row.get(name) for name in columns] for row in rows])
 
@@ -285,11 +285,11 @@ class TensorBoardWriter(TensorBoardOutputFormat):
             self.writer._get_file_writer().add_event(Event(session_log=restarted), steps + 1)
 
 
-def _hparams(settings: dict[str, Any]) -> HParam:
+def _hparams(settings: dict[str, object]) -> HParam:
     """Return a configuration as TensorBoard's hyperparameters: numbers, words and switches by their paths."""
     flat: dict[str, bool | float | str] = {}
 
-    def take(value: Any, path: str) -> None:
+    def take(value: object, path: str) -> None:
         if isinstance(value, dict):
             for key, inner in value.items():
                 take(inner, f"{path}.{key}" if path else str(key))
@@ -320,7 +320,7 @@ def dump_late(logger: Logger, steps: int) -> None:
     logger.name_to_excluded.clear()
 
 
-def make_logger(config: LoggerConfig, run: Path, iteration: int, settings: dict[str, Any], steps: int = 0) -> Logger:
+def make_logger(config: LoggerConfig, run: Path, iteration: int, settings: dict[str, object], steps: int = 0) -> Logger:
     """Build SB3's logger with the configured writers.
 
     Args:

@@ -31,7 +31,7 @@ START = "start.json"
 class Weights:
     """The state of a policy, and its origin as in ``start.json``."""
 
-    policy: dict[str, Any]
+    policy: dict[str, Tensor]
     about: dict[str, Any]
 
 

@@ -41,7 +41,7 @@ DIFF, LONGEST_DIFF = "git.diff", 5_000_000
 PACKAGES = ("torch", "stable-baselines3", "gymnasium", "mujoco-core", "numpy", "hydra-core", "mujoco-warp", "warp-lang")
 
 
-def write(run: Path, container: dict[str, Any]) -> None:
+def write(run: Path, container: Mapping[str, object]) -> None:
     """Create a run folder with configuration and versions of the run.
 
     Raises:
@@ -118,7 +118,7 @@ def read_as_written(run: Path) -> dict[str, Any]:
     return {str(k): v for k, v in container.items()}
 
 
-def _meta(container: dict[str, Any]) -> dict[str, Any]:
+def _meta(container: Mapping[str, object]) -> dict[str, object]:
     def version(package: str) -> str | None:
         try:
             return importlib.metadata.version(package)
@@ -148,7 +148,7 @@ def _git(*arguments: str, folder: Path | None = None) -> str | None:
     return done.stdout.strip()
 
 
-def _gpus() -> dict[str, Any]:
+def _gpus() -> dict[str, object]:
     """Return NVIDIA's driver and the GPUs, as the driver reports them; empty without one."""
     place = Path("/proc/driver/nvidia")
     try:
@@ -174,7 +174,7 @@ PLUGINS = "plugins"
 """In the run folder."""
 
 
-def keep_plugins(run: Path, container: Mapping[str, Any]) -> list[dict[str, Any]]:
+def keep_plugins(run: Path, container: Mapping[str, Any]) -> list[dict[str, object]]:
     """Copy the files of a configuration's plugins into ``run``; return their records for ``meta.json``.
 
     One that the configuration does not name (of ``GO1EXP_PLUGINS`` or an entry point) counts if a term of it is used.
@@ -194,7 +194,7 @@ def keep_plugins(run: Path, container: Mapping[str, Any]) -> list[dict[str, Any]
     return records
 
 
-def with_kept_plugins(run: Path, container: Mapping[str, Any]) -> dict[str, Any]:
+def with_kept_plugins(run: Path, container: Mapping[str, object]) -> dict[str, Any]:
     """Return the configuration with the run's copies of its plugins in the place of what it names.
 
     Raises:
@@ -221,7 +221,7 @@ def with_kept_plugins(run: Path, container: Mapping[str, Any]) -> dict[str, Any]
     return {**container, plugins.KEY: names}
 
 
-def differing_plugins(run: Path, container: Mapping[str, Any]) -> list[str]:
+def differing_plugins(run: Path, container: Mapping[str, object]) -> list[str]:
     """Return the names of a configuration's plugins whose content is another than that of the run's copy."""
     kept = {r["name"]: r["sha256"] for r in _records(run) if "file" in r}
     given = [n for n in plugins.names(container.get(plugins.KEY)) if n in kept and Path(n).is_file()]
@@ -280,7 +280,7 @@ def _copy_of(run: Path, plugin: Plugin) -> bool:
     return plugin.file is not None and plugin.file.parent == (run / PLUGINS).resolve()
 
 
-def _kept_file(run: Path, plugin: Plugin) -> dict[str, Any]:
+def _kept_file(run: Path, plugin: Plugin) -> dict[str, object]:
     """Copy a plugin's file, unless it is the run's copy already."""
     assert plugin.file is not None
     assert plugin.content is not None
@@ -299,7 +299,7 @@ def _kept_file(run: Path, plugin: Plugin) -> dict[str, Any]:
     return {"name": plugin.name, "file": target.relative_to(run).as_posix(), "sha256": plugin.sha256}
 
 
-def _kept_package(plugin: Plugin) -> dict[str, Any]:
+def _kept_package(plugin: Plugin) -> dict[str, object]:
     """Say which package it is: its version, and its commit if it lies in a git repository."""
     spec = importlib.util.find_spec(plugin.module)
     commit = _git("rev-parse", "HEAD", folder=Path(spec.origin).parent) if spec is not None and spec.origin else None

@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import Any
 
 import numpy as np
 import torch
@@ -169,7 +168,7 @@ def build(config: TrainConfig, group: Group | None = None) -> AdaptivePPO:
     return ppo
 
 
-def train(config: TrainConfig, container: dict[str, Any], run: Path, first: Weights | None = None) -> AdaptivePPO:
+def train(config: TrainConfig, container: dict[str, object], run: Path, first: Weights | None = None) -> AdaptivePPO:
     """Train in ``run``, from its newest checkpoint if it has one, on as many GPUs as asked for; return the learner.
 
     SIGINT, SIGTERM and SIGHUP end training after the iteration under way, with a checkpoint. A third SIGINT ends it at
@@ -223,7 +222,7 @@ def _close(ppo: AdaptivePPO, logger: Logger, evaluation: AsyncEvaluation, comple
     logger.close()
 
 
-def train_as_member(container: dict[str, Any], run: Path, group: Group) -> None:
+def train_as_member(container: dict[str, object], run: Path, group: Group) -> None:
     """Train as another member of ``group`` than its first: without files, log and signal handlers."""
     config = parse_train(run_folder.with_kept_plugins(run, container))
     ppo = _begun(config, run, None, group)

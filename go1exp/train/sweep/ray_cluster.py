@@ -13,6 +13,7 @@ import socket
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
@@ -110,7 +111,7 @@ class Ray:
         cloudpickle.register_pickle_by_value(command)  # the workers of a cluster need not find this package
         self._fits(ray)
 
-    def _fits(self, ray: Any) -> None:
+    def _fits(self, ray: ModuleType) -> None:
         """Refuse jobs that no node could ever run: they would wait for ever."""
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         wanted = {"CPU": float(self.settings.cpus), "GPU": self.settings.gpus}
@@ -140,7 +141,7 @@ def _refuse_silence(address: str | None) -> None:
         raise Expected(f"ray: no cluster at {address!r} ({why}); hydra.launcher.address=null starts one here") from None
 
 
-def _follow(ray: Any, tasks: dict[Any, Task], watch: Watch) -> None:
+def _follow(ray: ModuleType, tasks: dict[Any, Task], watch: Watch) -> None:
     """Tell of each task when it ends, and now and then of those that have begun.
 
     Raises:
@@ -154,7 +155,7 @@ def _follow(ray: Any, tasks: dict[Any, Task], watch: Watch) -> None:
         watch.changed()
 
 
-def _stop(ray: Any, references: list[Any]) -> None:
+def _stop(ray: ModuleType, references: list[Any]) -> None:
     """Have the tasks end with a checkpoint, and wait for that."""
     print("\nstopping the jobs after the iteration under way, with a checkpoint", file=sys.stderr, flush=True)
     for reference in references:
@@ -162,7 +163,7 @@ def _stop(ray: Any, references: list[Any]) -> None:
     ray.wait(references, num_returns=len(references), timeout=STOP_S)
 
 
-def _result(ray: Any, reference: Any) -> Ended:
+def _result(ray: ModuleType, reference: Any) -> Ended:
     try:
         how: Ended = ray.get(reference)
     except Exception as error:  # Ray's own: the node died too often, the task was cancelled

@@ -30,7 +30,7 @@ from go1exp.train.sweep.launchers import shares
 from go1exp.train.sweep.trials import FOLDER, LOOK_S
 
 if TYPE_CHECKING:
-    import optuna
+    from optuna import Study, Trial
     from optuna.trial import FrozenTrial
 
 
@@ -91,7 +91,7 @@ class Range:
         """A value that may be drawn."""
         return self.choices[0] if self.choices else self.low
 
-    def draw(self, trial: optuna.Trial, key: str) -> float | str:
+    def draw(self, trial: Trial, key: str) -> float | str:
         """Draw for one of Optuna's trials."""
         if self.choices:
             return trial.suggest_categorical(key, list(self.choices))
@@ -144,7 +144,7 @@ class Search:
         finished = [t for t in study.get_trials(deepcopy=False) if t.value is not None and t.state.name == "COMPLETE"]
         return study.best_trial if finished else None
 
-    def _study(self) -> optuna.Study:
+    def _study(self) -> Study:
         """Open Optuna's study."""
         import optuna
 
@@ -170,7 +170,7 @@ class Search:
             study.set_user_attr(key, value)
         return study
 
-    def _work(self, study: optuna.Study, share: tuple[int, ...], search: str) -> None:
+    def _work(self, study: Study, share: tuple[int, ...], search: str) -> None:
         """Run one trial after the other on the cores of ``share``; ``search`` is the name of this search."""
         while not self._stopping:
             with self._lock:
@@ -190,9 +190,7 @@ class Search:
                 continue
             self._try(study, trial, drawn, share)
 
-    def _try(
-        self, study: optuna.Study, trial: optuna.Trial, drawn: dict[str, float | str], share: tuple[int, ...]
-    ) -> None:
+    def _try(self, study: Study, trial: Trial, drawn: dict[str, float | str], share: tuple[int, ...]) -> None:
         import optuna
 
         run = self.folder / trial.user_attrs.get(FOLDER, f"trial-{trial.number:04}")
@@ -223,9 +221,7 @@ class Search:
             words = " ".join(f"{key}={value}" for key, value in drawn.items())
             print(f"trial {trial.number}: {result}  {words}", flush=True)
 
-    def _train(
-        self, trial: optuna.Trial, run: Path, share: tuple[int, ...]
-    ) -> tuple[Ended, list[tuple[int, float]], bool]:
+    def _train(self, trial: Trial, run: Path, share: tuple[int, ...]) -> tuple[Ended, list[tuple[int, float]], bool]:
         """Run a trial's training; return how it ended, its metric by iteration, and whether it was hopeless."""
         words = (sys.executable, "-m", "go1exp.cli.child", PARENT, CORES, "train", f"resume='{run}'")
         command = Command(
@@ -267,7 +263,7 @@ class Search:
         for running in list(self._running.values()):
             running.stop()
 
-    def _write(self, study: optuna.Study) -> None:
+    def _write(self, study: Study) -> None:
         """Write the trials as the index of a sweep, and the best one's settings."""
         begun = [t for t in study.get_trials(deepcopy=False) if FOLDER in t.user_attrs and t.params]
         newest = {t.user_attrs[FOLDER]: t for t in begun}  # one that went on has its folder from an older one
