@@ -60,8 +60,7 @@ def make_filter(config: FilterConfig) -> _kalman.Filter:
     settings = module.Settings()
     for name in FilterConfig.__dataclass_fields__:
         setattr(settings, name, _plain(module, name, getattr(config, name)))
-    compiled_filter: _kalman.Filter = module.Filter(settings)
-    return compiled_filter
+    return module.Filter(settings)
 
 
 def compiled_legs(config: FilterConfig) -> list[_kalman.Leg]:

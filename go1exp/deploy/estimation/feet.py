@@ -80,8 +80,7 @@ class LoadByBoth:
 
     def mixed(self, counts: np.ndarray, by_torque: np.ndarray) -> np.ndarray:
         """Return loads (4,), N, from counts (4,) and the forces (4,), N, that balance the torques."""
-        load: np.ndarray = 0.5 * (self._calibration.forces(counts) + by_torque)
-        return load
+        return 0.5 * (self._calibration.forces(counts) + by_torque)
 
     def loads(self, counts: np.ndarray, q: np.ndarray, torque: np.ndarray, quat: np.ndarray) -> np.ndarray:
         """Return loads (4,), N, from counts (4,), angles (12,) rad, torques (12,) N m and the attitude w-x-y-z."""

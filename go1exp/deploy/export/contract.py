@@ -65,7 +65,7 @@ TURNED = {
 }
 """Joints whose direction other models have reversed together."""
 
-USUAL: dict[str, tuple[Any, ...]] = {
+USUAL: dict[str, tuple[float | tuple[float, ...], ...]] = {
     "base_linear_velocity": (1.0, 2.0),
     "base_angular_velocity": (1.0, 0.25, 0.2),
     "velocity_command": (1.0, (2.0, 2.0, 0.25)),
@@ -197,7 +197,7 @@ def drive(
 def alternatives(spec: Spec) -> Iterator[tuple[str, Spec]]:
     """Yield contracts that differ from the stated one in one respect, with its name."""
 
-    def law(one: Spec) -> tuple[Any, ...]:
+    def law(one: Spec) -> tuple[object, ...]:
         joints = (tuple(one.joints(key)) for key in ("joint_sign", "kp", "kd", "default_pose", "action_scale"))
         return one.names, one.observation, one.history_order, one.history_layout, *joints
 

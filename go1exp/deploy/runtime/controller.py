@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, cast
+from typing import Protocol, cast
 
 import numpy as np
 
@@ -338,7 +338,7 @@ class Controller:
         """Return the policy's command; None, and a fault, if the estimate or the commanded velocity is not finite."""
         command = self._commands(now - self._since) if self.phase == "walking" else np.zeros(3)
         self._velocity = np.asarray(command, dtype=float)
-        given: dict[str, Any] = {
+        given: dict[str, np.ndarray | float] = {
             "joint_pos": state.joint_pos,
             "joint_vel": state.joint_vel,
             "imu_gyro": state.imu_gyro,

@@ -24,13 +24,13 @@ BLIND_S = 0.1
 LONGEST_AHEAD = 0.01
 """Longest extrapolation by one reading of the accelerometer, s."""
 
-LOADED: dict[str, Any] = {"contact_low": 20.0, "contact_high": 40.0}
+LOADED = {"contact_low": 20.0, "contact_high": 40.0}
 """Apparent force of a swinging foot by the leg's inertia, N, and force from which a foot is loaded."""
 
-TORQUE: dict[str, Any] = {"contact_source": "torque", **LOADED}
+TORQUE: dict[str, str | float] = {"contact_source": "torque", **LOADED}
 """Contact from the joints' torques, for a robot whose foot sensors are not calibrated (``docs/estimation.md``)."""
 
-BOTH: dict[str, Any] = {"contact_source": "force", **LOADED}
+BOTH: dict[str, str | float] = {"contact_source": "force", **LOADED}
 """Contact from torques and calibrated foot sensors together (``docs/estimation.md``)."""
 
 Fail = Callable[[str, str, float], None]

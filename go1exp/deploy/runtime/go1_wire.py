@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -88,7 +88,7 @@ def sealed(packet: np.ndarray) -> bytes:
 # ---------------------------------------------------------------------- commands
 
 
-def _blank(kind: np.dtype[Any]) -> np.ndarray:
+def _blank(kind: np.dtype[np.void]) -> np.ndarray:
     packet = np.zeros(1, kind)
     packet["head"], packet["level"] = HEAD, LOW_LEVEL
     return packet
@@ -105,7 +105,7 @@ IDLE = _idle()
 """The vendor's InitCmdData, byte by byte: a command without any torque, to which the robot answers."""
 
 
-def _bytes_of(kind: np.dtype[Any], *paths: tuple[str, ...]) -> np.ndarray:
+def _bytes_of(kind: np.dtype[np.void], *paths: tuple[str, ...]) -> np.ndarray:
     """Return the byte offsets of fields in a packet, of the twelve motors in order: (bytes,).
 
     Indexing bytes by these offsets is several times as fast as NumPy's records.
@@ -127,14 +127,14 @@ _U1, _F4, _I2, _U2 = (np.dtype(kind) for kind in ("u1", "<f4", "<i2", "<u2"))
 _REACH = {kind: (int(np.iinfo(kind).min), int(np.iinfo(kind).max)) for kind in (_I2, _U2)}
 
 
-def _whole(values: Sequence[float], step: float, kind: np.dtype[Any]) -> list[int]:
+def _whole(values: Sequence[float], step: float, kind: np.dtype[np.integer]) -> list[int]:
     """Return values in whole steps, cut towards zero and to a type's range; lists of a dozen are faster than NumPy."""
     low, high = _REACH[kind]
     whole = [int(value / step) for value in values]  # exact: a step is a power of two
     return whole if low <= min(whole) and max(whole) <= high else [min(max(n, low), high) for n in whole]
 
 
-def _motors(packet: bytearray, kind: np.dtype[Any]) -> np.ndarray:
+def _motors(packet: bytearray, kind: np.dtype[np.void]) -> np.ndarray:
     """Return the twelve motors in a packet, to be written."""
     motors: np.ndarray = np.frombuffer(packet, kind)["motor"][0]
     return motors[:JOINTS]

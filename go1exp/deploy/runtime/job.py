@@ -155,8 +155,9 @@ def run_job(job: Job, say: Say) -> int:
     try:
         with signals.handled(signals.interrupt), _connected(job, bundle, say) as (link, process):
             contact = "torque" if job.counting else None
-            given: dict[str, Any] = {"contact": contact, "feet": feet, "mover": job.mover, "gains": job.gains}
-            outcome = walk(bundle, link, job.plan, on_second=say, **given)
+            outcome = walk(
+                bundle, link, job.plan, contact=contact, feet=feet, on_second=say, mover=job.mover, gains=job.gains
+            )
     except KeyboardInterrupt:
         if outcome is not None:
             raise

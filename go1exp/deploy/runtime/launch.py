@@ -78,7 +78,7 @@ class SimulatedRobot(contextlib.AbstractContextManager["SimulatedRobot"]):
         self.report: dict[str, Any] = {}
         self.truth: dict[str, np.ndarray] = {}
         self.applied: np.ndarray | None = None
-        given: dict[str, Any] = {"bundle": bundle, "sim": dict(sim), "robot": dict(other)}
+        given: dict[str, object] = {"bundle": bundle, "sim": dict(sim), "robot": dict(other)}
         given |= {"truth": str(self._truth), "kept": SPARE * keep + SPARE_S}
         assert self._process.stdin is not None
         try:

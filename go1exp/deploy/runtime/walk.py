@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
 import numpy as np
 
@@ -132,7 +131,7 @@ def _estimator(
     """Return the estimator of a bundle's policy; none if the policy has no use for it, unless ``needed``."""
     if not needed and all(port.name != "base_lin_vel_b" for port in bundle.policy.inputs):
         return NoEstimator()
-    changes: dict[str, Any] = {}
+    changes: dict[str, str | float] = {}
     if contact == "torque":
         changes = TORQUE if feet is None else BOTH
     config = settings(bundle.metadata.estimator, **changes)

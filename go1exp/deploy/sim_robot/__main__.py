@@ -29,7 +29,7 @@ from go1exp.robot import JOINTS
 from go1exp.sim.effects.rules import actuator_problems
 from go1exp.sim.task import TaskConfig, parse_parts, parse_train
 
-WITHOUT_POLICY: dict[str, Any] = {
+WITHOUT_POLICY = {
     **{group: {} for group in ("reward", "rand", "event", "termination", "curriculum", "schedule")},
     "observation": {"joint_position": {}},
     "command": {"term": "fixed_velocity"},
@@ -73,7 +73,7 @@ def _line(descriptor: int) -> bytes:
     return text
 
 
-def _say(what: str, **content: Any) -> None:
+def _say(what: str, **content: object) -> None:
     sys.stdout.write(json.dumps({"what": what, **content}) + "\n")
     sys.stdout.flush()
 

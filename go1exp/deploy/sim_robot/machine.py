@@ -255,8 +255,7 @@ def _origin(terrain: Terrain, tile: tuple[int, int]) -> np.ndarray:
     rows, columns = terrain.tile_origins.shape[:2]
     if tile[0] >= rows or tile[1] >= columns:
         raise ConfigError([f"tile = {list(tile)}: the ground has {rows} rows and {columns} columns, counted from 0"])
-    origin: np.ndarray = terrain.tile_origins[tile]
-    return origin
+    return terrain.tile_origins[tile]
 
 
 def noisy(true: Mapping[str, np.ndarray], share: float, rng: np.random.Generator) -> dict[str, np.ndarray]:
