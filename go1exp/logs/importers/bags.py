@@ -36,7 +36,7 @@ class State:
 
     log_ns: int  # time of logging, ns
     stamp_ns: int  # time of its header, ns; 0 if it has none
-    source: tuple[Any, ...]  # what tells publishers of one topic apart
+    source: tuple[int | str, ...]  # what tells publishers of one topic apart
     names: tuple[str, ...]  # joints
     # ``position``, ``velocity`` and ``effort``, one value for each joint, or none
     fields: Mapping[str, Sequence[float]]
@@ -49,7 +49,7 @@ class Kind:
 
     types: tuple[str, ...]
     model: type[Decoded]
-    joints: Callable[[Any], tuple[int, tuple[Any, ...], tuple[str, ...], Mapping[str, Sequence[float]]]]
+    joints: Callable[[Any], tuple[int, tuple[int | str, ...], tuple[str, ...], Mapping[str, Sequence[float]]]]
     others: Mapping[str, str] = field(default_factory=dict)  # other types -> how to import them, after "; "
 
 
@@ -164,7 +164,7 @@ def _until_the_cut(records: Iterator[Any]) -> Iterator[tuple[Any, Any, Any]]:
             yield schemas.get(channel.schema_id), channel, record
 
 
-def _decoder(where: str, factory: Any, schema: Any, encoding: str, wanted: Kind) -> Callable[[bytes], Any]:
+def _decoder(where: str, factory: Any, schema: Any, encoding: str, wanted: Kind) -> Callable[[bytes], object]:
     if encoding == "json":
         return json.loads
     if encoding == "ros1":
@@ -174,13 +174,13 @@ def _decoder(where: str, factory: Any, schema: Any, encoding: str, wanted: Kind)
     if schema is None or schema.name not in wanted.types:
         name = schema.name if schema else "without a type"
         raise RecordingError(f"{where}: must be {wanted.types[0]}, not {name}{wanted.others.get(name, '')}")
-    decode: Callable[[bytes], Any] | None = factory.decoder_for(encoding, schema)
+    decode: Callable[[bytes], object] | None = factory.decoder_for(encoding, schema)
     if decode is None:
         raise RecordingError(f"{where}: {encoding} with a {schema.encoding} schema; cdr with ros2msg, or json, is read")
     return decode
 
 
-def _checked(where: str, wanted: Kind, decode: Callable[[bytes], Any], data: bytes) -> Decoded:
+def _checked(where: str, wanted: Kind, decode: Callable[[bytes], object], data: bytes) -> Decoded:
     if data[:4] == b"\x28\xb5\x2f\xfd":  # ros2 bag record --compression-mode message
         import zstandard
 

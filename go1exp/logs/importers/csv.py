@@ -75,7 +75,7 @@ def _is_number(column: object) -> bool:
     return isinstance(column, int) and not isinstance(column, bool)
 
 
-def _columns(given: Mapping[str, Any], joints: tuple[str, ...] | None) -> tuple[dict[str, Column], list[str]]:
+def _columns(given: Mapping[str, object], joints: tuple[str, ...] | None) -> tuple[dict[str, Column], list[str]]:
     """Return channel -> column (a list in one column is all joints or axes), and what is wrong with them as written."""
     mapping, wrong = {}, []
     for name, value in given.items():

@@ -20,7 +20,7 @@ PACKAGES = ("unitree_go", "ros2_unitree_legged_msgs", "unitree_legged_msgs")
 
 STOP = 1e6  # rad; the value by which a command says that it has no target, 2.146e9, lies above it
 
-Joints = tuple[int, tuple[Any, ...], tuple[str, ...], Mapping[str, Sequence[float]]]
+Joints = tuple[int, tuple[int | str, ...], tuple[str, ...], Mapping[str, Sequence[float]]]
 """Stamp, ns, source, names and values of a message, as ``bags.Kind`` has them."""
 
 Vector = Annotated[tuple[float, ...], Field(min_length=3, max_length=3)]

@@ -118,7 +118,7 @@ def episodes(labels: np.ndarray | None, t: np.ndarray | None, rows: int) -> list
     return named
 
 
-def _label(value: Any) -> str:
+def _label(value: float | str) -> str:
     """Return the value of an episode's column as a part of a file's name."""
     whole = not isinstance(value, str) and value == int(value)
     return re.sub(r"[^\w.-]+", "_", str(int(value) if whole else value)).strip("_") or "_"

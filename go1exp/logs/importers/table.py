@@ -68,7 +68,7 @@ class Table:
 class _NoNumber(ValueError):
     """A cell that is no number: what it is, and where it stands in the file."""
 
-    def __init__(self, cell: Any, place: str) -> None:
+    def __init__(self, cell: object, place: str) -> None:
         super().__init__(f"must be numbers, but {place} has {cell!r}")
         self.cell = str(cell)
 

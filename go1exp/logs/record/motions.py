@@ -7,7 +7,7 @@ off at times ``torque_enable`` (0 or 1). Other columns, such as gains for a play
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
@@ -91,13 +91,13 @@ def playback(
 
 
 @excitation("policy", closed_loop=True)
-def policy(*_: Any) -> None:
+def policy(*_: object) -> None:
     """A trained policy walks under random commands (needs ``run``)."""
     raise NotImplementedError("a policy is played in closed loop, by go1exp.logs.record.simulate.play_policy")
 
 
 @excitation("mpc", closed_loop=True)
-def mpc(*_: Any) -> None:
+def mpc(*_: object) -> None:
     """A model predictive controller walks under random commands, by position targets alone; needs no policy."""
     raise NotImplementedError("a controller is played in closed loop, by go1exp.logs.record.simulate.play_policy")
 

@@ -76,8 +76,7 @@ def make_motion(term: Term, seconds: float, rate_hz: float, seed: int) -> Motion
     t = np.arange(round(seconds * rate_hz)) / rate_hz
     if not len(t):
         raise ConfigError([f"seconds = {seconds:g}: shorter than a sample of the motion at {rate_hz:g} Hz"])
-    motion: Motion = term(t, robot.NOMINAL_STANCE.copy(), robot.soft_limits(SOFT_LIMIT), np.random.default_rng(seed))
-    return motion
+    return term(t, robot.NOMINAL_STANCE.copy(), robot.soft_limits(SOFT_LIMIT), np.random.default_rng(seed))
 
 
 def refuse_too_long(config: RecordingConfig, key: str, count: int, each: int = 1, others: int = 0) -> None:
