@@ -70,7 +70,7 @@ def write_text(path: str | Path, text: str) -> None:
     write_bytes(path, text.encode())
 
 
-def write_json(path: str | Path, content: Any, **options: Any) -> None:
+def write_json(path: str | Path, content: object, **options: Any) -> None:
     """Write a whole JSON file (see ``replacing``); ``options`` go to ``json.dumps``."""
     write_text(path, json.dumps(content, **{"indent": 2, **options}) + "\n")
 

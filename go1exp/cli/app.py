@@ -36,7 +36,7 @@ class App:
     """
 
     name: str
-    task: Callable[[dict[str, Any]], int | None]
+    task: Callable[[dict[str, object]], int | None]
     settings: type | None = None
     """Class of the settings that are no group's, for the help; None for ``train``, whose are in ``go1exp.sim.task``."""
     sweep: Callable[[App, Sequence[Path], hydra_main.Sweep], int] | None = None
@@ -250,7 +250,7 @@ MEANING = "files and packages with terms of your own, such as [my_terms.py] (doc
 """Of the key ``plugins``, for the help."""
 
 
-def begin(verb: str, container: dict[str, Any]) -> dict[str, Any]:
+def begin(verb: str, container: dict[str, object]) -> dict[str, Any]:
     """Load the plugins of a command line and its run; return the other settings; raise ConfigError if one fails."""
     if verb == "train":  # whose configuration is parsed with its plugins
         plugins.begin()
@@ -267,12 +267,12 @@ def begin(verb: str, container: dict[str, Any]) -> dict[str, Any]:
 
 T = TypeVar("T")
 
-Reader = Callable[[Any], Any]
+Reader = Callable[[Any], object]
 """Turns what stands under a key into what the verb works with; raises ConfigError."""
 
 
 def parse_with_groups(
-    kind: type[T], container: Mapping[str, Any], groups: Sequence[str], **others: Reader
+    kind: type[T], container: Mapping[str, object], groups: Sequence[str], **others: Reader
 ) -> tuple[T, dict[str, Any]]:
     """Return a verb's settings of class ``kind``, and by key what was read of its groups and further keys.
 
@@ -313,6 +313,6 @@ EXAMPLES = {
 """Settings without a default, and how they are given."""
 
 
-def parse(kind: type[T], container: Mapping[str, Any]) -> T:
+def parse(kind: type[T], container: Mapping[str, object]) -> T:
     """Validate a composed configuration as ``kind``; raise ConfigError with every problem."""
     return schema.parse(kind, container, EXAMPLES)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from go1exp.base.files import write_json
 from go1exp.cli.app import App, parse, spinner
@@ -72,7 +72,7 @@ GOALS = {
 """Figures with a goal: its value and what it is. Lower limits, but where they say `at most`."""
 
 
-def _task(container: dict[str, Any]) -> None:
+def _task(container: dict[str, object]) -> None:
     settings = parse(BenchSettings, container)
     show = spinner(settings.rounds, f"measuring {settings.suite}", at_once=True)
 

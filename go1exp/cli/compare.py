@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
@@ -19,7 +20,9 @@ from go1exp.config.schema.physics import PhysicsStep
 from go1exp.config.schema.registry import ConfigError
 
 if TYPE_CHECKING:
+    from go1exp.evaluate.controller.types import TrunkVelocity
     from go1exp.evaluate.protocol.base import Chosen
+    from go1exp.evaluate.protocol.comparing import Difference
     from go1exp.evaluate.protocol.playing import Result
 
 
@@ -48,7 +51,7 @@ class CompareSettings:
             raise ValueError(f"subjects = {list(self.subjects)}: each only once")
 
 
-def _task(container: dict[str, Any]) -> None:
+def _task(container: dict[str, object]) -> None:
     import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
     from go1exp.evaluate.protocol.base import chosen
 
@@ -98,7 +101,7 @@ def _refuse_rates(named_subjects: list[tuple[Named, Variation]]) -> None:
             raise ConfigError([f"subjects: {named.label} {reason}; leave {RATES} out, also of protocol=paper"])
 
 
-def _with(protocols: list[Chosen], trunk_velocity: Any) -> list[Chosen]:
+def _with(protocols: list[Chosen], trunk_velocity: TrunkVelocity | None) -> list[Chosen]:
     """Return the protocols with another velocity, where a subject has one."""
     if trunk_velocity is None:
         return protocols
@@ -108,7 +111,7 @@ def _with(protocols: list[Chosen], trunk_velocity: Any) -> list[Chosen]:
     ]
 
 
-def _report(plays: dict[str, list[Result]], folder: Path, about: dict[str, Any]) -> None:
+def _report(plays: dict[str, list[Result]], folder: Path, about: dict[str, object]) -> None:
     from go1exp.evaluate.protocol import comparing
     from go1exp.evaluate.protocol.pages import comparison
     from go1exp.evaluate.protocol.playing import as_json
@@ -132,7 +135,7 @@ def _report(plays: dict[str, list[Result]], folder: Path, about: dict[str, Any])
     print(f"written to {folder / 'compare.html'}, {folder / 'compare.json'}, rows beside them")
 
 
-def lines(differences: dict[str, Any]) -> list[str]:
+def lines(differences: Mapping[str, Sequence[Difference]]) -> list[str]:
     """Return the lines for a terminal: significant differences, and the number of the others."""
     from go1exp.base.report.table import interval_text
     from go1exp.evaluate.protocol.pages import condition_text

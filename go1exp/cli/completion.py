@@ -357,7 +357,7 @@ def _file(files: dict[str, Path], choice: str, group: str) -> tuple[dict[str, An
     return whole, "# @package _global_" in files[choice].read_text(encoding="utf-8")
 
 
-def _merge(into: dict[str, Any], other: dict[str, Any]) -> None:
+def _merge(into: dict[str, Any], other: dict[str, object]) -> None:
     for key, value in other.items():
         if isinstance(value, dict) and isinstance(into.get(key), dict):
             _merge(into[key], value)
@@ -371,7 +371,7 @@ def _select(settings: Any, path: str) -> Any:
     return settings
 
 
-def _plain(value: Any) -> str:
+def _plain(value: object) -> str:
     if isinstance(value, dict):
         return ""
     return f"[{','.join(map(str, value))}]" if isinstance(value, list) else str(value)

@@ -85,7 +85,7 @@ class DeploySettings(Stages):
     out: str
 
 
-def _task(container: dict[str, Any]) -> int:
+def _task(container: dict[str, object]) -> int:
 
     other = {name: container[name] for name in ROBOT_GROUPS if container.get(name) is not None}
     settings = parse(DeploySettings, {name: value for name, value in container.items() if name not in ROBOT_GROUPS})
@@ -130,7 +130,7 @@ def _task(container: dict[str, Any]) -> int:
             remove_empty(Path(settings.out))
 
 
-def _refuse_misfits(settings: DeploySettings, other: dict[str, Any], controlled: bool) -> None:
+def _refuse_misfits(settings: DeploySettings, other: dict[str, object], controlled: bool) -> None:
     """Raise ConfigError if settings do not go together; ``other``: choices of the simulated robot's groups."""
     if settings.bundle is None:
         raise ConfigError([f"bundle: required, such as {EXAMPLES['bundle']}"])

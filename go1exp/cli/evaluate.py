@@ -111,7 +111,7 @@ GRID_ONLY = (
 """Keys of ``go1exp eval`` that are the grid's."""
 
 
-def chosen_protocols(container: dict[str, Any], plain: dict[str, Any]) -> tuple[list[Chosen], bool]:
+def chosen_protocols(container: dict[str, object], plain: dict[str, Any]) -> tuple[list[Chosen], bool]:
     """Return the protocols of a configuration, and whether the grid is one; raise ConfigError with every problem.
 
     ``plain`` is ``conf/eval.yaml`` as it stands: changed keys of the grid are a problem where it is not played.
@@ -183,7 +183,7 @@ def note_replaced(folder: Path, files: Sequence[str], other: str = "folder=NAME"
 
 
 def play_protocols(
-    protocols: Sequence[Chosen], subject: Named, folder: Path, other: dict[str, Any], rates: Rates
+    protocols: Sequence[Chosen], subject: Named, folder: Path, other: dict[str, object], rates: Rates
 ) -> None:
     """Play protocols one after the other, write what came of each, and print the verdicts."""
     from go1exp.evaluate.protocol.pages import write
@@ -218,7 +218,7 @@ def result_lines(result: Result) -> list[str]:
     return [*text_lines, *(f"  note: {note}" for note in result.played.notes)]
 
 
-def _measures(given: Any) -> list[Term]:
+def _measures(given: object) -> list[Term]:
     """Resolve the measures, all of them for None; raise ConfigError with every problem of them."""
     from go1exp.mdp.measures import every_measure
 
@@ -233,12 +233,12 @@ def _measures(given: Any) -> list[Term]:
 class _Conditions:
     """Conditions of an evaluation: the robot's parts that differ, the engine, another controller than a policy."""
 
-    other: dict[str, Any]
+    other: dict[str, object]
     engine: BackendConfig
     controller: MpcSettings | None
 
 
-def _protocols(settings: Any, protocols: list[Any], conditions: _Conditions) -> None:
+def _protocols(settings: EvalSettings, protocols: list[Chosen], conditions: _Conditions) -> None:
     refuse_rates(protocols, conditions.controller.name if conditions.controller else None, settings.policy_dt)
     subject = subjects.subject_of(settings, conditions.controller, "protocols")
     announce(f"evaluating {subject.label}")
@@ -251,7 +251,7 @@ def _protocols(settings: Any, protocols: list[Any], conditions: _Conditions) -> 
     play_protocols(protocols, subject, folder, conditions.other, rates)
 
 
-def _task(container: dict[str, Any]) -> None:
+def _task(container: dict[str, object]) -> None:
     engine, container = subjects.split_engine(container)
     other, container = subjects.split_robot(container)
     choice = {"protocol": container.pop("protocol")}
@@ -276,7 +276,7 @@ def _task(container: dict[str, Any]) -> None:
         _grid(settings, measures, conditions, subject)
 
 
-def _check_grid(settings: Any) -> None:
+def _check_grid(settings: EvalSettings) -> None:
     if settings.bundle is not None:
         raise ConfigError([f"bundle = {settings.bundle!r}: protocol=grid takes run or policy; choose another protocol"])
     grid_is_empty = not all((settings.grid.x, settings.grid.y, settings.grid.yaw))
@@ -284,7 +284,7 @@ def _check_grid(settings: Any) -> None:
         raise ConfigError(["grid: with cross=true every axis needs at least one value, such as grid.yaw=[0.0]"])
 
 
-def _grid(settings: Any, measures: list[Term], conditions: _Conditions, subject: Named) -> None:
+def _grid(settings: EvalSettings, measures: list[Term], conditions: _Conditions, subject: Named) -> None:
     show = spinner(1, "evaluating", at_once=True)
     from go1exp.config.schema.settings import subset
     from go1exp.evaluate import criteria, table

@@ -17,6 +17,8 @@ from go1exp.config.schema import settings as schema
 from go1exp.config.schema.registry import FolderName
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from go1exp.deploy.runtime.bundle import Bundle
 
 
@@ -52,7 +54,7 @@ class ExportCheckSettings:
     file: Annotated[str, Field(min_length=1)]
 
 
-def _export(container: dict[str, Any]) -> None:
+def _export(container: dict[str, object]) -> None:
     settings = parse(ExportSettings, container)
     run, out = trained(settings.run, settings.policy, "bundle.zip", settings.out)
     checkpoint = checkpoint_file(run, settings.checkpoint)
@@ -84,7 +86,7 @@ APP = App("export", _export, ExportSettings)
 WIDTH = 120  # of the table where there is no terminal, characters
 
 
-def _check(container: dict[str, Any]) -> None:
+def _check(container: dict[str, object]) -> None:
     settings = parse(ExportCheckSettings, container)
 
     from rich.console import Console
@@ -108,7 +110,7 @@ def _check(container: dict[str, Any]) -> None:
     print(f"good: every hash matches, {steps} steps replayed, largest difference {worst:.1e}")
 
 
-def tables(bundle: Bundle) -> list[Any]:
+def tables(bundle: Bundle) -> list[Table]:
     """Return rich tables of what a bundle holds: the policy, its inputs and outputs, its joints, the members."""
     from rich.table import Table
 
@@ -190,7 +192,7 @@ class ExportImportSettings:
     force: bool
 
 
-def _import(container: dict[str, Any]) -> None:
+def _import(container: dict[str, object]) -> None:
     settings = parse(ExportImportSettings, container)
     file = Path(settings.network)
     out = Path(settings.out or f"{file.stem}.zip")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from go1exp.base.files import write_json
 from go1exp.cli.app import App, announce, parse_with_groups, spinner
@@ -69,7 +69,7 @@ def _with_gains(recordings: list[Recording], gains: tuple[float, float] | None) 
     return chosen
 
 
-def _task(container: dict[str, Any]) -> None:
+def _task(container: dict[str, object]) -> None:
     settings, parts = parse_with_groups(FitActuatorSettings, container, ("robot",))
 
     recordings = _with_gains(read_all(settings.recordings), settings.gains)

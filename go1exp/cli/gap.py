@@ -72,7 +72,7 @@ class GapVerb:
             refuse_no_logs(self.logs)
 
 
-def with_logs(container: dict[str, Any]) -> dict[str, Any]:
+def with_logs(container: dict[str, object]) -> dict[str, Any]:
     """Return the settings, without logs for ``report`` and ``view``; raise ConfigError if a stage was to be a verb."""
     from go1exp.cli.completion import STAGES
 
@@ -85,7 +85,7 @@ def with_logs(container: dict[str, Any]) -> dict[str, Any]:
     return container
 
 
-def _task(container: dict[str, Any]) -> int:
+def _task(container: dict[str, object]) -> int:
     from go1exp.gap.robots.description import parse_model
 
     groups = ("robot",) if container.get("contact") is None else ("robot", "contact")

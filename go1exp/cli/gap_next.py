@@ -10,7 +10,7 @@ from pydantic import Field
 
 from go1exp.base.errors import FAILED, NOT_SEPARABLE
 from go1exp.base.files import write_json
-from go1exp.cli.app import App, parse_with_groups
+from go1exp.cli.app import App, Reader, parse_with_groups
 from go1exp.cli.gap import Logs, _progress, refuse_no_logs, refuse_unknown
 from go1exp.cli.places import long_enough, read_all, writable
 from go1exp.cli.record import RIG, _motions
@@ -18,11 +18,13 @@ from go1exp.cli.verbs import command
 from go1exp.config.schema import settings as schema
 from go1exp.config.schema.physics import RecordedStep
 from go1exp.config.schema.registry import ConfigError, FolderName
-from go1exp.gap.design.plan import DesignSettings
+from go1exp.gap.design.plan import Attitude, DesignSettings
 from go1exp.gap.result import GapSettings
 from go1exp.logs.record.plan import RecordingConfig
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from go1exp.gap.stages.loop import Turn
     from go1exp.gap.stages.next import NextResult
 
@@ -79,7 +81,7 @@ class GapLoopSettings(RecordingConfig):
 TARGETS, ANSWER = "next.csv", "next.json"  # names of the files in the output folder
 
 
-def _next(container: dict[str, Any]) -> int:
+def _next(container: dict[str, object]) -> int:
     from go1exp.gap import files
     from go1exp.gap.robots.description import parse_model
 
@@ -161,12 +163,12 @@ def record_command(result: NextResult, file: Path) -> str:
     return command("record", settings=settings)
 
 
-def _few(values: Any) -> str:
+def _few(values: np.ndarray) -> str:
     """Write gains: one number if all joints have the same."""
     return f"{values[0]:g}" if min(values) == max(values) else ", ".join(f"{v:g}" for v in values)
 
 
-def _attitude(attitude: Any) -> str:
+def _attitude(attitude: Attitude) -> str:
     if attitude.roll is None:
         return "the base as it was in the recordings"
     return f"the trunk at roll {attitude.roll:g} and pitch {attitude.pitch:g} rad"
@@ -178,14 +180,14 @@ NEXT = App("gap_next", _next, GapNextSettings)
 TABLE = "loop.json"  # name of the file with a row for each round
 
 
-def _loop(container: dict[str, Any]) -> int:
+def _loop(container: dict[str, object]) -> int:
     import go1exp.logs.excitations
     import go1exp.logs.record.motions  # noqa: F401  (registers every excitation)
     from go1exp import robot as go1
     from go1exp.gap.robots.description import Go1Model, parse_model
     from go1exp.sim.effects.rules import actuator_problems
 
-    readers: dict[str, Any] = {"excitation": _motions, "model": parse_model}
+    readers: dict[str, Reader] = {"excitation": _motions, "model": parse_model}
     settings, parts = parse_with_groups(GapLoopSettings, container, RIG, **readers)
     refuse_unknown(settings.search.effects)
     problems = actuator_problems(parts["actuator"], parts["effect"], go1.JOINTS)

@@ -64,7 +64,7 @@ def _composed(verb: str, arguments: Sequence[str], folders: Sequence[Path]) -> d
         return compose(verb)
 
 
-def _page(verb: str, title: str, container: Mapping[str, Any]) -> list[str]:
+def _page(verb: str, title: str, container: Mapping[str, object]) -> list[str]:
     hydra_help = load(config_folder() / f"{verb}.yaml")["hydra"]["help"]
     groups = groups_of(verb)
     usage = f"{title} {'[group=choice ...] ' if groups else ''}[key=value ...]"
@@ -83,7 +83,7 @@ def _page(verb: str, title: str, container: Mapping[str, Any]) -> list[str]:
 
 
 def _group_page(
-    title: str, group: str, groups: Mapping[str, str | None], container: Mapping[str, Any], folders: Sequence[Path]
+    title: str, group: str, groups: Mapping[str, str | None], container: Mapping[str, object], folders: Sequence[Path]
 ) -> list[str]:
     lines = [f"{title}: group {group}", "", f"Choices ({group}=NAME, or {group}=FILE.yaml; * without it):"]
     for name, file in choice_files(group, folders).items():
@@ -160,7 +160,7 @@ def _choices(verb: str, group: str, default: str | None) -> str:
     return listed + WITHOUT_IN.get((verb, group), WITHOUT.get(group, "; without it that of training"))
 
 
-def leaves(container: Mapping[str, Any], path: str = "") -> dict[str, Any]:
+def leaves(container: Mapping[str, object], path: str = "") -> dict[str, Any]:
     """Return the leaves by key path; an empty mapping is a leaf."""
     flat: dict[str, Any] = {}
     for key, value in container.items():
@@ -168,7 +168,7 @@ def leaves(container: Mapping[str, Any], path: str = "") -> dict[str, Any]:
     return flat
 
 
-def _plain(value: Any) -> str:
+def _plain(value: object) -> str:
     """Write a value as the command line takes it."""
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
@@ -200,7 +200,7 @@ class ListSettings:
     group: str | None
 
 
-def _list(container: dict[str, Any]) -> None:
+def _list(container: dict[str, object]) -> None:
     import go1exp.evaluate.protocol.kinds
     import go1exp.logs.excitations
     import go1exp.logs.importers

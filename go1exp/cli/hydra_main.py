@@ -103,7 +103,7 @@ _on_sweep: list[Callable[[Sweep], int | None]] = []
 class SweepStart(Callback):
     """Hydra's hook before a sweep (``hydra.callbacks`` in ``conf/train.yaml``)."""
 
-    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+    def on_multirun_start(self, config: DictConfig, **kwargs: object) -> None:
         """Leave Hydra with the list of jobs, unless another sweeper than Hydra's own decides which there are."""
         if not _on_sweep:
             return

@@ -6,7 +6,7 @@ import dataclasses
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from go1exp.base import memory
 from go1exp.cli import subjects
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 FORMATS = (".mp4", ".gif")  # endings of a clip's file; the picture beside it is a .png
 
 
-def _task(container: dict[str, Any]) -> None:
+def _task(container: dict[str, object]) -> None:
     engine, container = subjects.split_engine(container)
     other, container = subjects.split_robot(container)
     ground = _ground(container)
@@ -68,7 +68,7 @@ def _task(container: dict[str, Any]) -> None:
     _show(core, drives.begin(core, "exact", settings.seed), settings, out, progress)
 
 
-def _ground(container: dict[str, Any]) -> TerrainConfig | None:
+def _ground(container: dict[str, object]) -> TerrainConfig | None:
     """Take out and return the ground that the group ``terrain`` names, None without it; raise ConfigError if none."""
     from go1exp.sim.task import required_parts
 

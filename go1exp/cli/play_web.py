@@ -112,7 +112,7 @@ def require_studio() -> None:
 
 def walk(
     subject: Named,
-    other: dict[str, Any],
+    other: dict[str, object],
     ground: TerrainConfig | None,
     engine: BackendConfig,
     settings: PlaySettings,
@@ -151,7 +151,7 @@ def walk(
     print(f"\nclosed after {session.time:.0f} s of walking, {session.falls} falls")
 
 
-def _agents(subject: Named, first: Agent, other: dict[str, Any]) -> dict[str, Callable[[], Agent]]:
+def _agents(subject: Named, first: Agent, other: dict[str, object]) -> dict[str, Callable[[], Agent]]:
     """Return what could drive this robot, loaded on request: shipped policies, newest runs, the MPC."""
 
     def loader(name: str) -> Callable[[], Agent]:
@@ -185,7 +185,7 @@ def _grounds(wanted: TerrainConfig | None) -> tuple[str, dict[str, Ground]]:
 
 def _sim_page(
     body: Body,
-    groups: dict[str, Any],
+    groups: dict[str, object],
     config: SimConfig,
     robot_at: tuple[str, int],
     seconds: float | None,
@@ -252,7 +252,7 @@ BODY = ("robot", "actuator", "effect", "contact", "terrain")
 """Groups of the configuration that describe the robot and its ground."""
 
 
-def _sim(container: dict[str, Any]) -> int:
+def _sim(container: dict[str, object]) -> int:
     from go1exp import robot
     from go1exp.deploy.runtime.udp import listening, parsed_address
     from go1exp.sim.effects.rules import actuator_problems

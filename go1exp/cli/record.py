@@ -111,12 +111,12 @@ POLICY, MPC = "policy", "mpc"
 COMMANDS = "gentle"  # random commands (``conf/command``) that a model predictive controller walks under
 
 
-def rig_groups(container: Mapping[str, Any]) -> tuple[str, ...]:
+def rig_groups(container: Mapping[str, object]) -> tuple[str, ...]:
     """Return the groups of a configuration that describe the robot to be recorded, the contact if there is a choice."""
     return (*RIG, CONTACT) if container.get(CONTACT) is not None else RIG
 
 
-def _motions(given: Any) -> list[Term]:
+def _motions(given: object) -> list[Term]:
     """Resolve the excitations; raise ConfigError with every problem of them."""
     if not given or not isinstance(given, list):
         what = "at least one is needed" if given == [] else "must be a list"
@@ -133,7 +133,7 @@ def _unused(settings: RecordSettings) -> list[str]:
     return wrong
 
 
-def _record(container: dict[str, Any]) -> None:
+def _record(container: dict[str, object]) -> None:
     import go1exp.logs.excitations
     import go1exp.logs.record.motions  # noqa: F401  (registers every excitation)
     from go1exp import robot
@@ -242,7 +242,7 @@ def _write(out: Path, recordings: list[Recording]) -> None:
 APP = App("record", _record, RecordSettings)
 
 
-def _audit(container: dict[str, Any]) -> int:
+def _audit(container: dict[str, object]) -> int:
     from go1exp.logs.recording import RecordingError
 
     settings = parse(AuditSettings, container)
@@ -300,7 +300,7 @@ AUDIT = App("record_audit", _audit, AuditSettings)
 MOST_NOTES = 10  # most notes of recordings that an import prints
 
 
-def _import(container: dict[str, Any]) -> None:
+def _import(container: dict[str, object]) -> None:
     from go1exp.cli.hydra_main import mapping_of
     from go1exp.logs.importers import import_recordings
 

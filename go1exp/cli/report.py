@@ -6,7 +6,7 @@ import dataclasses
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from go1exp.cli.app import App, announce, parse, spinner
 from go1exp.config.schema.registry import ConfigError
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from go1exp.evaluate.report.study import Study
 
 
-def _task(container: dict[str, Any]) -> None:
+def _task(container: dict[str, object]) -> None:
     container = dict(container)
     protocols = _protocols(container.pop("protocol"), bool(container.get("eval")))
     settings = parse(ReportSettings, container)
@@ -48,7 +48,7 @@ def _task(container: dict[str, Any]) -> None:
         log_tables(plain_rows(made), files[0], settings.project, settings.wandb, folder)
 
 
-def _protocols(given: Any, asked: bool) -> list[Chosen | None]:
+def _protocols(given: object, asked: bool) -> list[Chosen | None]:
     """Return what ``eval=true`` plays, None for the grid; raise ConfigError with every problem."""
     import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
     from go1exp.evaluate.protocol.base import chosen

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 ENGINE = "engine"
 
 
-def split_engine(container: dict[str, Any]) -> tuple[BackendConfig, dict[str, Any]]:
+def split_engine(container: dict[str, object]) -> tuple[BackendConfig, dict[str, Any]]:
     """Return the checked engine, and other settings; raise ConfigError of all problems, or if not installed."""
     from go1exp.config.schema.physics import PhysxBackend
     from go1exp.sim.task import parse_parts
@@ -42,7 +42,7 @@ ROBOT_GROUPS = ("actuator", "effect", "contact")
 """Groups that a run's own choice can be replaced in; null or absent keeps it."""
 
 
-def split_robot(container: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+def split_robot(container: dict[str, object]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the checked choices of another robot, by group, and other settings; raise ConfigError of problems."""
     from go1exp.sim.task import required_parts
 
@@ -76,7 +76,7 @@ CONDITIONS = "paper"
 """Shipped policy whose robot, ground and noise another controller walks under where no run is named."""
 
 
-def chosen_controller(given: Any) -> MpcSettings | None:
+def chosen_controller(given: object) -> MpcSettings | None:
     """Return the settings of a controller other than a policy, None for a policy; raise ConfigError or SolverError."""
     settings = parse_controller({"name": "policy"} if given is None else given)
     if not isinstance(settings, MpcSettings):
@@ -205,7 +205,7 @@ def word(given: str, file: str) -> Named:
     )
 
 
-def agent(subject: Named, other: dict[str, Any], robot_of: TaskConfig | None = None) -> Agent:
+def agent(subject: Named, other: dict[str, object], robot_of: TaskConfig | None = None) -> Agent:
     """Load what drives the robots, with choices of another robot (``split_robot``), or with the robot of a task.
 
     Raise ConfigError of a configuration that this version does not know, and BundleError of a damaged bundle.
@@ -236,7 +236,7 @@ SAME = ("robot", "actuator", "effect", "contact", "rand", "termination")
 """Parts of a task that are the robot's and not the policy's."""
 
 
-def _robot(task: TaskConfig, other: dict[str, Any], robot_of: TaskConfig | None) -> TaskConfig:
+def _robot(task: TaskConfig, other: dict[str, object], robot_of: TaskConfig | None) -> TaskConfig:
     if robot_of is not None:
         task = dataclasses.replace(task, **{part: getattr(robot_of, part) for part in SAME})
     return with_robot(task, other)

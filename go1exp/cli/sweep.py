@@ -253,7 +253,7 @@ def _command(run: Path, overrides: Sequence[str], cwd: str) -> Command:
     return Command(words, cwd, str(run / LOG), {"PYTHONPATH": path} if path else {})
 
 
-def _in_process(rules: Rules, app: App, watch: _Watch, job: Any, overrides: list[str]) -> Callable[[], None]:
+def _in_process(rules: Rules, app: App, watch: _Watch, job: index.Job, overrides: list[str]) -> Callable[[], None]:
     """Return what runs a job in this process and outlives its failure."""
 
     def work() -> None:

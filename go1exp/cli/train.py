@@ -56,7 +56,7 @@ def _may_change(key: str) -> bool:
     return any(key == other or key.startswith(f"{other}.") for other in RESUMABLE)
 
 
-def _refuse_other(run: Path, container: dict[str, Any]) -> None:
+def _refuse_other(run: Path, container: dict[str, object]) -> None:
     """Raise ConfigError if ``run`` holds a run with another configuration: it would be neither one nor the other."""
     from go1exp.train import run_folder
 
@@ -91,7 +91,7 @@ class TrainJob:
     resumed: bool
 
 
-def resolved(container: dict[str, Any], overrides: list[str], run: Path) -> TrainJob:
+def resolved(container: dict[str, object], overrides: list[str], run: Path) -> TrainJob:
     """Return the training of a configuration, in ``run`` unless it resumes; touches no file; raise ConfigError."""
     from go1exp.sim.task import parse_train
 
@@ -109,7 +109,7 @@ def check(job: TrainJob) -> None:
     preflight.check(job.config)
 
 
-def _task(container: dict[str, Any]) -> int | None:
+def _task(container: dict[str, object]) -> int | None:
     about = hydra_main.job()
     folder, overrides = about.folder, about.overrides
     try:

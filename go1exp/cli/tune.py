@@ -6,7 +6,6 @@ import importlib.util
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from go1exp.base.errors import FAILED
 from go1exp.cli import hydra_main, train
@@ -46,7 +45,7 @@ def _empty(drawn: Range) -> str | None:
     return "a logarithm needs numbers above 0" if drawn.log and drawn.low <= 0 else None
 
 
-def _tune(container: dict[str, Any]) -> int | None:
+def _tune(container: dict[str, object]) -> int | None:
     settings = parse(TuneSettings, container)
     ranges = _ranges(settings.space)
     if importlib.util.find_spec("optuna") is None:

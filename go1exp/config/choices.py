@@ -22,7 +22,7 @@ FOLDERS = {"rand": "randomization", "hydra/launcher": "launcher"}
 """Group -> its folder, where that has another name."""
 
 _GROUP_OF_FOLDER = {folder: group for group, folder in FOLDERS.items()}
-_Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def config_folder() -> Path:
@@ -121,7 +121,7 @@ def loaded(text: str, loader: Any) -> Any:
     return {} if content is None else content
 
 
-def _written_out(content: Any, known: dict[int, int]) -> int:
+def _written_out(content: object, known: dict[int, int]) -> int:
     """Return how many values there are when every alias is written out; too many where one leads back."""
     if not isinstance(content, dict | list):
         return 1

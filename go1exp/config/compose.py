@@ -130,7 +130,7 @@ def _no_such_key(key: str, given: str, name: str, overrides: Sequence[str], fold
     return f"{given}: no such key {key!r}; {hint}"
 
 
-def key_values(container: Any, path: str = "") -> dict[str, Any]:
+def key_values(container: object, path: str = "") -> dict[str, Any]:
     """Flatten nested mappings: every key path, with its value (a mapping's own path is there too, with None)."""
     if not isinstance(container, dict):
         return {path: container}

@@ -75,19 +75,19 @@ def read_yaml(file: Path, resolve: bool = False) -> Any:
     return OmegaConf.to_container(OmegaConf.create(loaded(file.read_text("utf-8"), get_yaml_loader())), resolve=resolve)
 
 
-def to_yaml(container: Mapping[str, Any]) -> str:
+def to_yaml(container: Mapping[str, object]) -> str:
     """Return plain data as the text of a YAML file."""
     return OmegaConf.to_yaml(OmegaConf.create(dict(container)))
 
 
-def with_values(container: Mapping[str, Any], settings: Sequence[str]) -> dict[str, Any]:
+def with_values(container: Mapping[str, object], settings: Sequence[str]) -> dict[str, Any]:
     """Return plain data with ``key.path=value`` settings merged into it."""
     config = OmegaConf.create(dict(container))
     config.merge_with_dotlist(list(settings))
     return plain(config, resolve=False)
 
 
-def plain(config: Any, resolve: bool = True) -> dict[str, Any]:
+def plain(config: DictConfig, resolve: bool = True) -> dict[str, Any]:
     """Return a mapping of OmegaConf as plain data, by default with interpolations resolved."""
     container = OmegaConf.to_container(config, resolve=resolve)
     assert isinstance(container, dict)
@@ -208,7 +208,7 @@ def seen_by(verb: str, folders: Sequence[Path]) -> Iterator[None]:
         VerbSource.hidden, _Folders.folders = before
 
 
-def store_choice(group: str, name: str, content: Any, file: Path) -> None:
+def store_choice(group: str, name: str, content: object, file: Path) -> None:
     """Make the content of a user's file a choice of a group."""
     replace: dict[str, Any] = {} if OLD else {"replace": True}
     ConfigStore.instance().store(group=group, name=name, node=content, provider=str(file), **replace)
@@ -282,7 +282,7 @@ def _with_choices(verb: str, choices: Sequence[Override], folders: tuple[Path, .
 
 
 @lru_cache(maxsize=64)
-def _kept(verb: str, choices: tuple[str, ...], folders: tuple[Path, ...], state: tuple[Any, ...]) -> bytes:
+def _kept(verb: str, choices: tuple[str, ...], folders: tuple[Path, ...], state: tuple[object, ...]) -> bytes:
     """Return ``conf/<verb>.yaml`` with choices, pickled; ``state`` is that of the files it may be made of."""
     return pickle.dumps(hydra.compose(verb, list(choices)))
 

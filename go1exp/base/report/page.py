@@ -6,7 +6,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import yaml
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -120,7 +119,7 @@ def sections(tables: Sequence[Table], drawings: Sequence[Drawing]) -> list[Secti
     return [*parts[:1], *plots, *parts[1:]]
 
 
-def provenance(notes: Sequence[str], settings: Mapping[str, Any]) -> Section:
+def provenance(notes: Sequence[str], settings: Mapping[str, object]) -> Section:
     """Return the last section: methods, and the settings as YAML."""
     plain = json.loads(json.dumps(settings, default=str))
     text = yaml.safe_dump(plain, default_flow_style=None, sort_keys=False, width=100, allow_unicode=True).strip()

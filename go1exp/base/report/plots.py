@@ -147,7 +147,7 @@ def band(axes: Axes, x: Any, low: Any, high: Any, colour: str) -> None:
     axes.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0)
 
 
-def intervals(axes: Axes, x: Any, entries: Any, name: str, colour: str, label: str, **options: Any) -> None:
+def intervals(axes: Axes, x: Sequence[float], entries: Any, name: str, colour: str, label: str, **options: Any) -> None:
     """Draw one quantity of a summary with its interval over x; entries without the quantity are skipped."""
     points = [(at, e["figures"].get(name)) for at, e in zip(x, entries, strict=True)]
     shown = [(at, f["estimate"], f["low"], f["high"]) for at, f in points if f and f["estimate"] is not None]

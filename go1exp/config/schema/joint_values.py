@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
@@ -26,7 +26,7 @@ def numbers(values: JointValues) -> tuple[float, ...]:
 def each_within(low: float, high: float = math.inf) -> WrapValidator:
     """Return a validator which demands values of one of the forms, every number between ``low`` and ``high``."""
 
-    def check(given: Any, parse: ValidatorFunctionWrapHandler) -> JointValues:
+    def check(given: object, parse: ValidatorFunctionWrapHandler) -> JointValues:
         try:
             values: JointValues = parse(tuple(given) if isinstance(given, list) else given)
         except ValidationError:

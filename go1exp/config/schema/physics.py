@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError
 
@@ -142,7 +142,7 @@ MUJOCO_CONTACT = ContactConfig(time_constant=0.02, cone="pyramidal", impratio=1.
 """MuJoCo's own: a mattress. Runs of go1exp 0.1 were trained on it."""
 
 
-def read_contact(given: Any) -> ContactConfig | None:
+def read_contact(given: object) -> ContactConfig | None:
     """Return a contact from plain data; None if that is none."""
     try:
         return TypeAdapter(ContactConfig).validate_json(as_json(given))

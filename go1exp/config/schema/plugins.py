@@ -22,7 +22,6 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from go1exp.config.schema import registry
 from go1exp.config.schema.registry import ConfigError, DuplicateError, Entry
@@ -70,7 +69,7 @@ _installed: dict[str, Plugin] | None = None
 """Of entry points, once they have been searched."""
 
 
-def names(given: Any) -> list[str]:
+def names(given: object) -> list[str]:
     """Return the plugins that a configuration's value means, one or a list; raise ConfigError if it is neither."""
     if given is None:
         return []
@@ -107,7 +106,7 @@ def begin(wanted: Sequence[str] | None = None) -> None:
         load(*wanted)
 
 
-def use(wanted: Any = ()) -> list[Plugin]:
+def use(wanted: object = ()) -> list[Plugin]:
     """Put into force a configuration's plugins, those of the environment variable and those loaded by hand.
 
     Of two files with one name and different contents, the configuration's counts: a run's copy goes before the file
@@ -262,11 +261,11 @@ class _FromContent(importlib.machinery.SourceFileLoader):
         super().__init__(module, str(file))
         self._content = content
 
-    def get_data(self, path: Any) -> bytes:
+    def get_data(self, path: str) -> bytes:
         """Return the content."""
         return self._content
 
-    def path_stats(self, path: Any) -> Any:
+    def path_stats(self, path: str) -> dict[str, object]:
         """Raise OSError: there is no byte code to compare with."""
         raise OSError
 

@@ -121,7 +121,7 @@ def unknown_name(path: str, name: str, known: Iterable[str], what: str) -> str:
     return f"{path}: unknown {what} {name!r}; {hint}"
 
 
-def as_json(settings: Any) -> str:
+def as_json(settings: object) -> str:
     """Dump settings for a strict schema, which takes lists for tuples and mappings for dataclasses only from JSON."""
     return json.dumps(settings)
 
@@ -238,7 +238,7 @@ class Entry:
             return f"a parameter has no usable type ({str(error).strip().splitlines()[0]})"
         return None
 
-    def check(self, parameters: Mapping[str, Any], path: str) -> tuple[dict[str, Any], list[str]]:
+    def check(self, parameters: Mapping[str, object], path: str) -> tuple[dict[str, Any], list[str]]:
         """Validate ``parameters``; return them with defaults filled in, and the problems."""
         try:
             values = self.schema.model_validate_json(as_json(parameters)).model_dump()
@@ -253,7 +253,7 @@ MORE: list[Callable[[], object]] = []
 """Called when a name is not known, to register what else is installed (``config/schema/plugins.py``)."""
 
 
-def register(group: str, name: str, **traits: Any) -> Callable[[F], F]:
+def register(group: str, name: str, **traits: object) -> Callable[[F], F]:
     """Class or function decorator: make the target known to ``group`` as ``name``.
 
     Raises:
@@ -350,12 +350,12 @@ class Term:
     parameters: Mapping[str, Any]
     slots: Mapping[str, Any] = field(default_factory=dict)
 
-    def __call__(self, *args: Any) -> Any:
+    def __call__(self, *args: object) -> Any:
         """Call the member (for a class: construct it) with ``args`` and the configured parameters."""
         return self.entry.target(*args, **self.parameters)
 
 
-def bind_list(group: str, given: Iterable[Any], path: str) -> list[Term]:
+def bind_list(group: str, given: Iterable[object], path: str) -> list[Term]:
     """Resolve a list of names and of ``{name: {parameter: value}}``; raise ConfigError with every problem of them."""
     items = [pair for item in given for pair in (item.items() if isinstance(item, Mapping) else [(item, {})])]
     bound = [bind(group, str(key), value, f"{path}.{key}") for key, value in items]
@@ -365,7 +365,7 @@ def bind_list(group: str, given: Iterable[Any], path: str) -> list[Term]:
 
 
 def bind(
-    group: str, key: str, settings: Any, path: str, slots: type[BaseModel] | None = None
+    group: str, key: str, settings: object, path: str, slots: type[BaseModel] | None = None
 ) -> tuple[Term | None, list[str]]:
     """Resolve one YAML item ``key: settings`` of ``group``; return the term (None if bad) and the problems.
 

@@ -53,7 +53,7 @@ def parse(kind: type[T], container: Mapping[str, Any], examples: Mapping[str, st
         raise ConfigError(explain(error, path, [f.name for f in fields(kind)])) from None  # type: ignore[arg-type]
 
 
-def subset(kind: type[T], given: Any, **others: Any) -> T:
+def subset(kind: type[T], given: object, **others: object) -> T:
     """Return the ``kind`` whose attributes are those of the same name of ``given``; ``others`` give the rest."""
     names = [f.name for f in fields(kind)]  # type: ignore[arg-type]
     return kind(**{**{name: getattr(given, name) for name in names if hasattr(given, name)}, **others})

@@ -11,7 +11,6 @@ In a test file beside your terms::
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 import go1exp.extend  # noqa: F401  (registers every term)
 from go1exp.config.schema import plugins
@@ -35,7 +34,7 @@ CHECKS = {
 """What a member of a group promises beyond its description; an importer's promises need one of its files."""
 
 
-def check_term(entry: Entry, parameters: Mapping[str, Any] | None = None, *, exact: bool = False) -> None:
+def check_term(entry: Entry, parameters: Mapping[str, object] | None = None, *, exact: bool = False) -> None:
     """Check what a registered term promises.
 
     Args:
@@ -54,7 +53,7 @@ def check_term(entry: Entry, parameters: Mapping[str, Any] | None = None, *, exa
 
 
 def check_terms(
-    entries: Iterable[Entry], parameters: Mapping[str, Mapping[str, Any]] | None = None, *, exact: bool = False
+    entries: Iterable[Entry], parameters: Mapping[str, Mapping[str, object]] | None = None, *, exact: bool = False
 ) -> list[str]:
     """Check terms; return what was checked, as ``group.name``.
 
@@ -81,7 +80,7 @@ def check_terms(
 
 
 def check_plugin(
-    name: str, parameters: Mapping[str, Mapping[str, Any]] | None = None, *, exact: bool = False
+    name: str, parameters: Mapping[str, Mapping[str, object]] | None = None, *, exact: bool = False
 ) -> list[str]:
     """Load a file or package and check every term that it registers; arguments and errors as ``check_terms``'s.
 

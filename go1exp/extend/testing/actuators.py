@@ -17,6 +17,7 @@ from go1exp.config.schema.joint_values import numbers
 from go1exp.config.schema.registry import ConfigError, Entry, Term, bind
 from go1exp.extend.testing.description import ALONE, CONTINUES, MASKED, checked, equal, expect
 from go1exp.robot.actuators import ActuatorSetup
+from go1exp.sim.actuator.motors import Actuator
 from go1exp.sim.effects.base import Effect
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import MANY_TERMS, TaskConfig, parse_task
@@ -55,12 +56,12 @@ def _moment(n: int, k: int, size: float = 1.0) -> tuple[Tensor, Tensor, Tensor]:
     return _noise(n, 0.3 * size, 3 * k), _noise(n, 0.3 * size, 3 * k + 1), _noise(n, 3.0 * size, 3 * k + 2)
 
 
-def check_actuator(entry: Entry, parameters: dict[str, Any], exact: bool) -> None:
+def check_actuator(entry: Entry, parameters: dict[str, object], exact: bool) -> None:
     """Torques within the limit; the same alone and in a batch; begins an episode anew; continues from its state."""
     values = checked(entry, parameters)
 
-    def make(n: int, first: int = 0) -> Any:
-        made = entry.target(go1_actuators(n, first), **values)
+    def make(n: int, first: int = 0) -> Actuator:
+        made: Actuator = entry.target(go1_actuators(n, first), **values)
         made.reset(torch.ones(n, dtype=torch.bool))
         return made
 
@@ -134,14 +135,14 @@ def _plain(steps: int) -> list[Tensor]:
     return _run(core, steps)
 
 
-def _bound(entry: Entry, values: dict[str, Any]) -> Term:
+def _bound(entry: Entry, values: dict[str, object]) -> Term:
     term, problems = bind("effect", entry.name, values, f"effect.{entry.name}", MANY_TERMS["effect"])
     if term is None:
         raise ConfigError(problems)
     return term
 
 
-def check_effect(entry: Entry, parameters: dict[str, Any], exact: bool) -> None:
+def check_effect(entry: Entry, parameters: dict[str, object], exact: bool) -> None:
     """Parameters with units and bounds; no effect at its null values; a state that is saved and restored.
 
     Parameters other than the null ones are needed for the rest: by default five tolerances, as far as the bounds go.

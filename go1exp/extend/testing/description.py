@@ -18,7 +18,7 @@ MASKED = "reset must touch masked rows only"
 """Promises of several kinds of terms."""
 
 
-def expect(entry: Entry, holds: Any, promise: str) -> None:
+def expect(entry: Entry, holds: object, promise: str) -> None:
     """Raise AssertionError, naming the term and its place, unless a promise holds."""
     if not holds:
         raise AssertionError(f"{entry.group}.{entry.name} ({entry.place}): {promise}")
@@ -31,7 +31,7 @@ def equal(a: Tensor, b: Tensor, exact: bool) -> bool:
     return torch.equal(a, b) if exact or not a.is_floating_point() else torch.allclose(a, b, rtol=RTOL, atol=ATOL)
 
 
-def checked(entry: Entry, parameters: dict[str, Any]) -> dict[str, Any]:
+def checked(entry: Entry, parameters: dict[str, object]) -> dict[str, Any]:
     """Return the parameters with defaults filled in; raise ConfigError if they do not fit."""
     values, problems = entry.check(parameters, f"{entry.group}.{entry.name}")
     if problems:

@@ -19,7 +19,7 @@ from go1exp.extend.testing.description import ALONE, CONTINUES, checked, equal, 
 from go1exp.logs.excitations import Motion
 from go1exp.mdp.kinematics import KinematicState
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu
-from go1exp.sim.physics.scene import build_model
+from go1exp.sim.physics.scene import Sensors, build_model
 from go1exp.sim.task import parse_parts
 from go1exp.sim.terrain import build_terrain
 
@@ -37,7 +37,7 @@ def everyone(n: int) -> Tensor:
 
 
 @cache
-def _scene() -> tuple[Any, Any]:
+def _scene() -> tuple[Any, Sensors]:
     parts, _ = parse_parts(compose("train"), ("robot", "terrain", "sim"))
     return build_model(parts["robot"], build_terrain(parts["terrain"]), parts["sim"].physics_dt)
 
@@ -49,8 +49,7 @@ def backend(n: int) -> MujocoCpu:
 
 def model_fields(robots: MujocoCpu) -> dict[str, Tensor]:
     """Return copies of all fields that differ between robots."""
-    copies: dict[str, Tensor] = robots.state_dict()["fields"]
-    return copies
+    return robots.state_dict()["fields"]
 
 
 def with_fields(robots: MujocoCpu, entry: Entry) -> dict[str, Tensor]:
@@ -73,7 +72,7 @@ def parts(state: KinematicState) -> dict[str, Tensor]:
     return {f.name: getattr(state, f.name).clone() for f in fields(KinematicState)}
 
 
-def check_randomization(entry: Entry, parameters: dict[str, Any], exact: bool) -> None:
+def check_randomization(entry: Entry, parameters: dict[str, object], exact: bool) -> None:
     """Draws by seed, the same alone and in a batch; of the model, in masked rows of declared fields only.
 
     A trait ``null`` (parameters at which the robot is the nominal one) is tried as well.
@@ -138,7 +137,7 @@ def _check_null(entry: Entry, values: dict[str, Any]) -> None:
     expect(entry, same, f"with {entry.traits['null']} the robot must stay the nominal one")
 
 
-def check_command(entry: Entry, parameters: dict[str, Any], exact: bool) -> None:
+def check_command(entry: Entry, parameters: dict[str, object], exact: bool) -> None:
     """A velocity (N, 3) in one tensor, the same alone and in a batch; continues from its saved state."""
     values = checked(entry, parameters)
     batch, alone = entry.target(stream(6), **values), entry.target(stream(1, first_env=4), **values)
@@ -166,7 +165,7 @@ def check_command(entry: Entry, parameters: dict[str, Any], exact: bool) -> None
     _check_continues(entry, make, step)
 
 
-def check_event(entry: Entry, parameters: dict[str, Any], exact: bool) -> None:
+def check_event(entry: Entry, parameters: dict[str, object], exact: bool) -> None:
     """Leaves a restarted robot alone; the same alone and in a batch; continues from its saved state."""
     values = checked(entry, parameters)
     batch, alone = entry.target(stream(5), **values), entry.target(stream(1, first_env=3), **values)
@@ -212,7 +211,7 @@ def _check_continues(
         expect(entry, all(torch.equal(v, b[k]) for k, v in a.items()), CONTINUES)
 
 
-def check_curriculum(entry: Entry, parameters: dict[str, Any], exact: bool) -> None:
+def check_curriculum(entry: Entry, parameters: dict[str, object], exact: bool) -> None:
     """Keeps levels on the map and treats each robot by itself."""
     rule, n = entry.target(**checked(entry, parameters)), 300
     generator = torch.Generator().manual_seed(0)
@@ -230,7 +229,7 @@ def check_curriculum(entry: Entry, parameters: dict[str, Any], exact: bool) -> N
 RATE_HZ, SECONDS = 200.0, 20.0
 
 
-def check_excitation(entry: Entry, parameters: dict[str, Any], exact: bool) -> None:
+def check_excitation(entry: Entry, parameters: dict[str, object], exact: bool) -> None:
     """A motion of the Go1's joints within their limits; the same for the same seed."""
     values = checked(entry, parameters)
     t = np.arange(round(SECONDS * RATE_HZ)) / RATE_HZ

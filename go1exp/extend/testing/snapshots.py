@@ -30,7 +30,7 @@ def random_snapshot(n: int, seed: int = 0) -> Snapshot:
     quat = Rotation.random(n, random_state=seed)
     touching = rng.random((n, 4)) < 0.5
     phase = rng.uniform(0.002, 0.4, (n, 4))
-    values: dict[str, Any] = {
+    values = {
         "base_pos_w": rng.normal(0.0, 3.0, (n, 3)),
         "base_quat_w": quat.as_quat(scalar_first=True),
         "base_lin_vel_b": rng.normal(0.0, 0.7, (n, 3)),
@@ -114,8 +114,7 @@ class _Made:
 
     def __call__(self, s: Snapshot) -> Tensor:
         if self.object is None:
-            result: Tensor = self.target(s, **self.values)
-            return result
+            return self.target(s, **self.values)
         if self.advances:
             self.object.advance(s)
         return self.object(s).clone()
@@ -126,7 +125,7 @@ class _Made:
         return {k: v.clone() for k, v in self.object.state_dict().items()}
 
 
-def check_reward(entry: Entry, parameters: dict[str, Any], exact: bool) -> None:
+def check_reward(entry: Entry, parameters: dict[str, object], exact: bool) -> None:
     """One finite float32 number per robot; a number among the parameters may be a tensor () that changes in place."""
     values = checked(entry, parameters)
     _check(entry, values, exact, (), torch.float32)
@@ -151,7 +150,7 @@ def _check_changing(entry: Entry, values: dict[str, Any], name: str) -> None:
         expect(entry, torch.allclose(changing(s), configured(s), rtol=1e-4, atol=1e-5), promise)
 
 
-def check_observation(entry: Entry, parameters: dict[str, Any], exact: bool) -> None:
+def check_observation(entry: Entry, parameters: dict[str, object], exact: bool) -> None:
     """As many finite float32 numbers per robot as ``size`` says."""
     expect(entry, isinstance(entry.traits.get("size"), int), "it must say how wide it is: @observation(name, size=3)")
     values = checked(entry, parameters)
@@ -179,7 +178,7 @@ def _check_mirror(entry: Entry, values: dict[str, Any]) -> None:
         expect(entry, same, "what a mirrored robot observes must be the image that mirror makes")
 
 
-def check_termination(entry: Entry, parameters: dict[str, Any], exact: bool) -> None:
+def check_termination(entry: Entry, parameters: dict[str, object], exact: bool) -> None:
     """One flag per robot."""
     _check(entry, checked(entry, parameters), exact, (), torch.bool)
 

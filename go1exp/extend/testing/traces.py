@@ -71,7 +71,7 @@ def without(trace: Trace, *names: str) -> Trace:
     return dataclasses.replace(trace, **missing)
 
 
-def check_measure(entry: Entry, parameters: dict[str, Any], exact: bool) -> None:
+def check_measure(entry: Entry, parameters: dict[str, object], exact: bool) -> None:
     """One number for each robot, or each of its feet: its own alone, NaN where undefined; and a unit."""
     values = checked(entry, parameters)
     per = entry.traits.get("per", "robot")
@@ -86,8 +86,7 @@ def check_measure(entry: Entry, parameters: dict[str, Any], exact: bool) -> None
         expect(entry, result.shape == (trace.robots, *shape[1:]), f"it must be (N{', 4' if per == 'foot' else ''})")
         kind = "U" if unit == "name" else "f"
         expect(entry, result.dtype.kind == kind, "it must be of floating point, or text if its unit is 'name'")
-        array: np.ndarray = result
-        return array
+        return result
 
     trace = random_trace()
     together = compute(trace)
