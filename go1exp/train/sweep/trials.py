@@ -13,7 +13,7 @@ import uuid
 from collections.abc import Iterator
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from go1exp.train import run_state
 
@@ -89,7 +89,7 @@ def put_back(study: optuna.Study, folder: Path, patience: float = PATIENCE_S) ->
         if _is_run(trial, folder):
             some_left = some_left or is_nameless(trial)
             continue
-        run = trial.user_attrs.get(FOLDER)
+        run = trial.user_attrs.get(FOLDER, "")
         goes_on = run and not is_superfluous(study, trial)
         if goes_on and not _continuations(study, trial.number) and not _ended(folder / run, until):
             some_left = True
@@ -144,7 +144,7 @@ def _continuations(study: optuna.Study, number: int) -> list[int]:
     return [t.number for t in study.get_trials(deepcopy=False) if t.user_attrs.get(CONTINUES) == number]
 
 
-def _is_run(trial: FrozenTrial, folder: Path) -> bool:
+def _is_run(trial: Any, folder: Path) -> bool:
     """Whether a search runs the trial; also where that cannot be known from here."""
     search, run = trial.user_attrs.get(SEARCH), trial.user_attrs.get(FOLDER)
     if search:
