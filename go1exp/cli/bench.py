@@ -76,7 +76,7 @@ def _task(container: dict[str, object]) -> None:
     settings = parse(BenchSettings, container)
     show = spinner(settings.rounds, f"measuring {settings.suite}", at_once=True)
 
-    from go1exp.sim.env.engine import refuse_too_many
+    from go1exp.sim.env.batch import refuse_too_many
     from go1exp.sim.task import parse_train
 
     on_gpu = settings.suite == "gpu"
@@ -87,7 +87,7 @@ def _task(container: dict[str, object]) -> None:
 
     from go1exp.evaluate.bench import env
 
-    refuse_too_many("num_envs", settings.num_envs, config.task.backend)
+    refuse_too_many("num_envs", settings.num_envs, config.task)
     much = env.Measured(settings.num_envs, settings.rounds, settings.seconds, show)
     if settings.suite == "env":
         figures = env.run(config.task, overrides, much)

@@ -20,8 +20,9 @@ from go1exp.evaluate.quantities import AXES, described, drawn, rows_of, share
 from go1exp.evaluate.recorder import Recorder, bytes_per_second
 from go1exp.mdp.commands import FixedVelocity
 from go1exp.mdp.measures import measured
+from go1exp.sim.env.batch import refuse_too_many
 from go1exp.sim.env.core import Go1Core
-from go1exp.sim.env.engine import make_backend, refuse_too_many
+from go1exp.sim.env.engine import make_backend
 from go1exp.sim.physics.agreement import Check, require, robots_needed
 from go1exp.sim.physics.scene import build_model
 from go1exp.sim.task import TaskConfig, time_rules
@@ -153,7 +154,7 @@ def _steps(config: EvalConfig, dt: float) -> tuple[int, int]:
 
 def _check_memory(config: EvalConfig, task: TaskConfig, rate: float) -> None:
     """Raise ConfigError if the robots do not fit into memory; TooLongError if ``rate`` B/s of measures do not."""
-    refuse_too_many("episodes", config.episodes, task.backend, len(config.commands))
+    refuse_too_many("episodes", config.episodes, task, len(config.commands))
     count = len(config.commands) * config.episodes
     seconds, available = config.seconds - config.settle_s, memory.free()
     if available is None or seconds * rate <= available:

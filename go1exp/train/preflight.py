@@ -16,8 +16,9 @@ from go1exp.config.schema.registry import ConfigError
 from go1exp.mdp.commands import AXES
 from go1exp.mdp.curricula import YAW_ARM
 from go1exp.sim.effects.rules import nested_actuators
+from go1exp.sim.env.batch import FLOAT_BYTES, robot_bytes
 from go1exp.sim.env.core import Go1Core
-from go1exp.sim.env.engine import FLOAT_BYTES, device_of, free_on, robot_bytes
+from go1exp.sim.env.engine import device_of, free_on
 from go1exp.sim.task import TrainConfig
 from go1exp.train import metrics
 from go1exp.train.schedule import check_measures
@@ -128,7 +129,7 @@ def needed_bytes(config: TrainConfig) -> int:
     outputs of one minibatch, and of its mirror image, which wait for the backward pass.
     """
     ppo, devices = config.ppo, config.process.devices
-    per_robot = robot_bytes(config.task.backend)
+    per_robot = robot_bytes(config.task, ppo.num_envs)
     row = len(config.task.observation) + len(config.task.critic) + 2 * robot.NUM_JOINTS + 6
     rollout = ppo.num_envs * ppo.steps
     samples = rollout // ppo.minibatches * (2 if ppo.symmetry else 1)

@@ -6,10 +6,28 @@ import operator
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from torch import Tensor
+
+from go1exp import robot
+from go1exp.base import memory
+from go1exp.base.wording import counted
+from go1exp.config.schema.physics import WarpBackend
 from go1exp.config.schema.registry import ConfigError
 from go1exp.sim.env.core import Go1Core
-from go1exp.sim.env.engine import refuse_too_many
+from go1exp.sim.env.engine import device_of, free_on
 from go1exp.sim.task import TaskConfig, parse_train
+
+MANY = 20_000
+"""Fewer robots fit almost always: their state is not counted, which takes a second."""
+
+ROBOT_BYTES, BESIDES_STATE = 6000, 5000
+"""On the CPU: least memory of a robot, and what a robot takes besides its state (measured: 5 to 9 kB)."""
+
+CONTACT_BYTES = 100
+"""A contact that MuJoCo Warp has room for: positions, frame, solver parameters, geoms."""
+
+FLOAT_BYTES = 4
+DEGREES_OF_FREEDOM = 6 + robot.NUM_JOINTS
 
 
 def make(
@@ -37,8 +55,45 @@ def make(
     """
     num_envs, seed = whole("num_envs", num_envs, 1), whole("seed", seed, 0)
     task = task_of(overrides)
-    refuse_too_many("num_envs", num_envs, task.backend)
+    refuse_too_many("num_envs", num_envs, task)
     return Go1Core(task, num_envs, seed, noise=noise, spread_starts=spread_starts)
+
+
+def robot_bytes(task: TaskConfig, robots: int) -> int:
+    """Return a lower bound of the memory of one of so many robots, B."""
+    if isinstance(task.backend, WarpBackend):
+        return FLOAT_BYTES * DEGREES_OF_FREEDOM * task.backend.njmax + CONTACT_BYTES * task.backend.nconmax
+    if robots < MANY:
+        return ROBOT_BYTES
+    core = Go1Core(task, 1)
+    core.reset()
+    return _size(core.state_dict()) + BESIDES_STATE
+
+
+def _size(state: object) -> int:
+    """Return the bytes of all tensors in nested dictionaries."""
+    if isinstance(state, dict):
+        return sum(map(_size, state.values()))
+    return state.nbytes if isinstance(state, Tensor) else 0
+
+
+def refuse_too_many(key: str, value: int, task: TaskConfig, each: int = 1) -> None:
+    """Refuse robots that for certain do not fit into memory.
+
+    Args:
+        key: setting that says how many robots there are.
+        value: its value.
+        task: what they do.
+        each: robots for each of it.
+
+    Raises:
+        go1exp.config.schema.registry.ConfigError: naming the setting, and how many would fit.
+    """
+    available = free_on(device_of(task.backend))
+    one = each * robot_bytes(task, value * each)
+    if available is not None and value * one > available:
+        amounts = f"with {counted(value * each, 'robot')} it {memory.too_much(value * one, available)}"
+        raise ConfigError([f"{key} = {value}: {amounts}; {available // one} at most would fit"])
 
 
 def task_of(overrides: object) -> TaskConfig:

@@ -8,27 +8,15 @@ from typing import Any, Protocol, TypeVar
 import torch
 from torch import Tensor
 
-from go1exp import robot
 from go1exp.base import memory
 from go1exp.base.tensors.randomness import EnvRandom
-from go1exp.base.wording import counted
 from go1exp.config.schema.physics import BackendConfig, PhysxBackend, WarpBackend
-from go1exp.config.schema.registry import ConfigError
 from go1exp.mdp.types import StepResult
 from go1exp.sim.physics.backend import PhysicsBackend
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu
 from go1exp.sim.physics.scene import Sensors
 
 T = TypeVar("T")
-
-CPU_ROBOT_BYTES = 6000
-"""One more robot on the CPU: physics state, own model fields, the MDP's tensors (measured: 6.2 kB at 4096)."""
-
-CONTACT_BYTES = 100
-"""A contact that MuJoCo Warp has room for: positions, frame, solver parameters, geoms."""
-
-FLOAT_BYTES = 4
-DEGREES_OF_FREEDOM = 6 + robot.NUM_JOINTS
 
 
 def make_backend(config: BackendConfig, model: Any, sensors: Sensors, num_envs: int) -> PhysicsBackend:
@@ -60,32 +48,6 @@ def free_on(device: torch.device) -> int | None:
     if device.type != "cuda":
         return memory.free()
     return int(torch.cuda.mem_get_info(device)[0]) if torch.cuda.is_available() else None
-
-
-def robot_bytes(config: BackendConfig) -> int:
-    """Return a lower bound of the memory of one more robot, B."""
-    if isinstance(config, WarpBackend):
-        return FLOAT_BYTES * DEGREES_OF_FREEDOM * config.njmax + CONTACT_BYTES * config.nconmax
-    return CPU_ROBOT_BYTES
-
-
-def refuse_too_many(key: str, value: int, config: BackendConfig, each: int = 1) -> None:
-    """Refuse robots that for certain do not fit into memory.
-
-    Args:
-        key: setting that says how many robots there are.
-        value: its value.
-        config: the engine.
-        each: robots for each of it.
-
-    Raises:
-        go1exp.config.schema.registry.ConfigError: naming the setting, and how many would fit.
-    """
-    one = each * robot_bytes(config)
-    available = free_on(device_of(config))
-    if available is not None and value * one > available:
-        amounts = f"with {counted(value * each, 'robot')} it {memory.too_much(value * one, available)}"
-        raise ConfigError([f"{key} = {value}: {amounts}; {available // one} at most would fit"])
 
 
 class Steps(Protocol):
