@@ -250,6 +250,14 @@ def test_first_episodes_may_begin_at_random_times_and_later_ones_at_zero(start_c
     assert not together.steps.any()
 
 
+def test_a_saved_first_episode_keeps_the_time_at_which_it_began(start_core: Make) -> None:
+    """It has lasted one step after the next one, however late it began."""
+    spread, resumed = start_core(*QUIET, num_envs=5, spread_starts=True), start_core(*QUIET, num_envs=5)
+    resumed.load_state_dict(spread.state_dict())
+    assert resumed.steps.any()
+    assert resumed.step(torch.zeros(5, 12)).episode_length.tolist() == [1] * 5
+
+
 # Noise and observation
 
 HALF_WIDTHS = [0.02] * 3 + [0.01] * 3 + [0.05] * 3 + [0.0] * 3 + [0.05] * 12 + [0.1] * 12 + [0.0] * 12

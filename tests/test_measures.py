@@ -190,6 +190,15 @@ def test_clearance_is_the_mean_over_swings_of_the_sole_s_top() -> None:
     )
 
 
+def test_the_step_in_which_a_foot_lands_is_part_of_its_swing() -> None:
+    """A foot that rises until it lands, in the middle of a step, is highest in that step."""
+    trace = pattern(PATTERNS["trot"], rate=2.3)
+    turn = (2.3 * np.arange(len(trace.contact))[:, None] * DT - np.array(PATTERNS["trot"]) + 1e-9) % 1.0
+    sole = 0.05 * np.clip((turn - 0.5) / 0.5, 0.0, 1.0)
+    highest = (robot.FOOT_RADIUS + sole).reshape(-1, SAMPLES, 1, 4).max(1)
+    np.testing.assert_allclose(value("clearance", dataclasses.replace(trace, foot_height=highest)), 0.05, rtol=0.01)
+
+
 def test_a_lame_leg_has_its_share_of_the_load() -> None:
     trace = pattern(PATTERNS["trot"])
     lame = dataclasses.replace(trace, foot_force=constant(trace, 40.0, 40.0, 6.0, 34.0))
