@@ -888,6 +888,24 @@ def test_a_column_that_holds_another_quantity_is_named(wrong: str, column: str, 
     assert "torque" in wrong or set(found) == {column}
 
 
+@pytest.mark.parametrize(("late", "decimals"), [(0, 3), (1, 3), (2, 3), (2, 9)])
+def test_a_target_that_is_a_rounded_or_earlier_angle_is_named(late: int, decimals: int) -> None:
+    sound = realistic(made("multisine"))
+    target = np.round(np.roll(sound.channels["q_FR_hip"], late), decimals)
+    (found,) = copies(Log(with_(sound, q_target_FR_hip=target)))
+    assert (found.channel, found.verdict) == ("q_target_FR_hip", "bad")
+
+
+@pytest.mark.parametrize("behind", [0.0005, 0.002, 0.02])
+@pytest.mark.parametrize("rate", [50.0, 500.0])
+def test_a_joint_that_follows_a_rounded_target_at_once_is_no_copy(rate: float, behind: float) -> None:
+    """Without noise, and half a millisecond to a row behind."""
+    sound = bench(rate)
+    target, q = (0.5 * np.sin(4.4 * s) + 0.2 * np.sin(14.5 * s) for s in (sound.t, sound.t - behind))
+    for decimals in (2, 3, 4):
+        assert not list(copies(Log(with_(sound, q_knee=q, q_target_knee=np.round(target, decimals)))))
+
+
 def test_what_follows_closely_and_what_is_ideal_is_no_copy() -> None:
     """Another sensor of the same quantity has noise of its own; in an ideal simulation columns agree."""
     sound, ideal = realistic(made("gait")), made("gait")

@@ -83,6 +83,29 @@ def _equal(log: Log, name: str, other: str) -> Iterator[Finding]:
             verdict = "ok" if ideal and kinds == ("tau_est", "tau_cmd") else _weight(log, kinds)
             yield finding("copy", name, verdict, share, "", message)
             return
+    if kinds == ("q_target", "q"):
+        yield from _rounded(log, name, other, a, b)
+
+
+def _rounded(log: Log, name: str, other: str, a: np.ndarray, b: np.ndarray) -> Iterator[Finding]:
+    """Report targets ``a`` (T,) that are angles ``b`` (T,) of the same or an earlier row, rounded.
+
+    Rows count in which the angle moves by many times the rounding: an actuator would have to follow its target within
+    a tenth of a row to pass for a copy, or to be ahead of it.
+    """
+    close = min(max(0.51 * signals.quantum(a), 1e-6 * float(np.ptp(b))), 2e-3 * float(np.ptp(b)))
+    for late in range(limits.LAW_ROWS):
+        earlier = np.roll(b, late)
+        fast = np.abs(np.roll(earlier, -1) - np.roll(earlier, 1)) > limits.FAST_STEPS * close
+        fast[: late + 1] = fast[-1:] = False
+        fast &= log.on
+        share = float(np.mean(np.abs(a - earlier)[fast] <= close)) if fast.sum() >= limits.ENOUGH else 0.0
+        if share > limits.ROUNDED:
+            rows = f" of {late} rows before" if late else " of the same row"
+            message = f"equals {other}{rows} up to rounding in {share:.1%} of the rows in which it moves fast"
+            why = MEANING["q_target", "q"]
+            yield finding("copy", name, _weight(log, ("q_target", "q")), share, "", f"{message}: {why}")
+            return
 
 
 def _shared(a: np.ndarray, b: np.ndarray, on: np.ndarray, close: float) -> tuple[float, int]:

@@ -123,6 +123,9 @@ EXCEEDED = 1.25
 
 COPIED = 0.15
 """Share of the rows in which two columns change where they are equal (chosen: 0.07 of coarse torques are by chance)."""
+FAST_STEPS, ROUNDED = 20.0, 0.97
+"""Times the rounding of a copy by which an angle must move within two rows, and share of these rows that must agree
+(a joint that follows 0.5 ms behind: 0.65 at most)."""
 COPY_ROWS = 4000  # rows by which most pairs of columns are told apart
 DERIVED, SAME_NOISE = 0.8, 0.3
 """Share of rows in which a channel is so near to what an angle gives, in standard deviations of the angle's noise
