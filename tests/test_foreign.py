@@ -131,6 +131,8 @@ JOINT_VELOCITY = (
         (GRAVITY % "quaternion: xyzw", "quaternion order: quaternion=wxyz"),
         (JOINT_VELOCITY, "joint_velocity scale=1"),
         ("kp: 60.0", "gains: kp x 1/3"),
+        ("kp: 40.0", "gains: kp x 1/2"),
+        ("kp: 10.0", "gains: kp x 2"),
         ("kd: 2.0", "gains: kd x 1/3"),
     ],
 )

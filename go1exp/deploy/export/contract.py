@@ -258,9 +258,9 @@ def _other_histories(spec: Spec) -> Iterator[tuple[str, Spec]]:
 
 
 def _other_gains(spec: Spec) -> Iterator[tuple[str, Spec]]:
-    """Yield contracts with a third and three times the gains, as far as the motors take them."""
+    """Yield contracts with a third, a half, two and three times the gains, as far as the motors take them."""
     for key in ("kp", "kd"):
-        for text, factor in (("1/3", 1.0 / 3.0), ("3", 3.0)):
+        for text, factor in (("1/3", 1.0 / 3.0), ("1/2", 0.5), ("2", 2.0), ("3", 3.0)):
             gains: dict[str, Any] = {key: tuple((factor * spec.joints(key)).tolist())}
             if max(gains[key]) <= MAX_GAIN:
                 yield f"gains: {key} x {text}", dataclasses.replace(spec, **gains)
@@ -347,7 +347,7 @@ def _likelier(stated: Outcome, config: TrainConfig, spec: Spec, network: Network
 
     Of the likelier ones up to three: the policy stands, and follows more closely, or sways less and follows as closely.
     """
-    if not stated.falls and stated.follows >= 1 - BETTER and np.isfinite(stated.sways):
+    if not stated.falls and stated.follows >= 1 - BETTER and stated.sways < STILL:
         return [], []
     others = list(alternatives(spec))
     outcomes, _, _ = drive(config, [other for _, other in others], network)
@@ -360,7 +360,8 @@ def _likelier(stated: Outcome, config: TrainConfig, spec: Spec, network: Network
     for (name, _), one in zip(others, outcomes, strict=True):
         # stance and gains change how a robot sways, whatever its policy reads; a sign turns the stance, too
         read = not name.startswith(("default pose", "gains", "scale: action", "sign"))
-        steadier = read and one.sways < calm and one.follows > stated.follows - STEADIER
+        walks = name.startswith("gains") and one.follows > max(stated.follows, WALKING)
+        steadier = (read or walks) and one.sways < calm and one.follows > stated.follows - STEADIER
         works = not one.falls and (one.follows > WALKING or one.sways < STILL)
         if works and (one.follows > least or steadier):
             likely.append((round(one.follows - one.sways, 2), f"{name} ({one})"))
