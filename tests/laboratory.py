@@ -52,13 +52,13 @@ def at_rest(
     dt: float,
     quat: Any = (1.0, 0.0, 0.0, 0.0),
 ) -> Plant:
-    """Return the plant of one robot with effects, held at an attitude; its joints rest at ``start`` (1, J)."""
-    backend, setup = robot.build(1, dt, quat, 1)
+    """Return the plant of N robots with effects, held at an attitude; their joints rest at ``start`` (N, J)."""
+    backend, setup = robot.build(len(start), dt, quat, 1)
     plant = Plant(backend, setup, robot.drive(), bind_list("effect", [effects], "effect"))
     if kp or kd:
         plant.set_gains(torch.full_like(plant.q, kp), torch.full_like(plant.q, kd))
     plant.startup()
-    everyone, begin = torch.ones(1, dtype=torch.bool), torch.as_tensor(start, dtype=plant.q.dtype)
+    everyone, begin = torch.ones(len(start), dtype=torch.bool), torch.as_tensor(start, dtype=plant.q.dtype)
     backend.reset(everyone, begin.clone(), torch.zeros_like(begin))
     plant.reset(everyone, begin)
     return plant

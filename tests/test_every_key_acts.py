@@ -33,6 +33,7 @@ import torch
 import yaml
 from mujoco.batch import Batch
 from omegaconf import OmegaConf
+from omegaconf.basecontainer import get_yaml_loader
 
 from go1exp.base.paths import data_root
 from go1exp.cli.app import app_of
@@ -280,9 +281,15 @@ def flat(node: Any, path: str) -> Iterator[tuple[str, Any]]:
         yield path, node
 
 
+class Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    """OmegaConf's numbers, read by libyaml: every worker of pytest reads all files before its first test."""
+
+    yaml_implicit_resolvers = get_yaml_loader().yaml_implicit_resolvers
+
+
 def read(file: str, conf: Path = CONF) -> dict[str, Any]:
     """What a file holds, without the choices that it makes."""
-    content = OmegaConf.to_container(OmegaConf.load(conf / f"{file}.yaml"))
+    content = yaml.load((conf / f"{file}.yaml").read_text(), Loader) or {}
     assert isinstance(content, dict)
     content.pop("defaults", None)
     return {str(key): value for key, value in content.items()}

@@ -46,7 +46,7 @@ from tests.made import FakeLink, low_state
 from tests.small_run import trained
 
 OBSERVATIONS = sorted(p.stem for p in (data_root() / "conf/observation").glob("*.yaml"))
-ROWS = 1000
+ROWS = 250
 
 
 @pytest.fixture(scope="module")

@@ -43,13 +43,13 @@ def pendulum(clock: str = "compare") -> FixedBase:
 def motions() -> list[tuple[np.ndarray, ...]]:
     """Times, angles, true speeds and targets of four motions of the pendulum with friction within its tolerance."""
     made: list[tuple[np.ndarray, ...]] = []
-    robot = pendulum("recorded")
     steps = np.arange(0.0, 7.0, 0.0005)
-    for n, speed in enumerate((3.0, 4.0, 6.0, 8.0)):
-        target = (0.8 * np.sin(speed * steps) + 0.4 * np.sin(2.3 * speed * steps))[:, None]
-        fine = played(robot, {"coulomb": {"bound": 0.01}}, target, 1)
+    phase = steps[:, None] * np.array([3.0, 4.0, 6.0, 8.0])
+    target = (0.8 * np.sin(phase) + 0.4 * np.sin(2.3 * phase))[..., None]
+    every = played(pendulum("recorded"), {"coulomb": {"bound": 0.01}}, target, 1)
+    for n, fine in enumerate(np.moveaxis(every, 1, 0)):
         q = fine[::EVERY] + 2e-4 * np.random.default_rng(n).standard_normal((len(steps[::EVERY]), 1))
-        made.append((steps[::EVERY], q, np.gradient(fine, 0.0005, axis=0)[::EVERY], target[::EVERY]))
+        made.append((steps[::EVERY], q, np.gradient(fine, 0.0005, axis=0)[::EVERY], target[::EVERY, n]))
     return made
 
 

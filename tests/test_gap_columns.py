@@ -37,8 +37,13 @@ def hung() -> State:
     return State(comparison.scorer, parts, settings, comparison.dt, terms=("coulomb",))
 
 
-def test_a_corrected_model_says_what_the_step_did_and_keeps_what_it_did_not_try(hung: State) -> None:
-    linear = hung.linear({}, hung.splits.train)
+@pytest.fixture(scope="module")
+def linear(hung: State) -> Table:
+    """The linear model about the nominal values."""
+    return hung.linear({}, hung.splits.train)
+
+
+def test_a_corrected_model_says_what_the_step_did_and_keeps_what_it_did_not_try(hung: State, linear: Table) -> None:
     layout = Layout.from_probes(hung.machine, linear.probes)
     rng = np.random.default_rng(1)
     step = np.where(rng.random(layout.size) < 0.3, rng.standard_normal(layout.size), 0.0)
@@ -59,8 +64,7 @@ def test_a_corrected_model_says_what_the_step_did_and_keeps_what_it_did_not_try(
     np.testing.assert_array_equal(same.columns, linear.columns)
 
 
-def test_borrowed_columns_are_those_that_were_measured_in_the_units_of_now(hung: State) -> None:
-    linear = hung.linear({}, hung.splits.train)
+def test_borrowed_columns_are_those_that_were_measured_in_the_units_of_now(hung: State, linear: Table) -> None:
     probes = tolerances.probes(hung.machine, hung.keys, THETA)
     twice = replace(hung.scorer, scale=2.0 * hung.scorer.scale)
     near = borrowed(linear, twice, THETA, probes, {FRICTION}, hung.dt)
@@ -81,8 +85,7 @@ def test_a_quantity_that_is_not_compared_has_columns_of_zero(hung: State) -> Non
     np.testing.assert_array_equal(near.columns, linear.columns)
 
 
-def test_columns_that_learn_come_as_far_as_columns_that_stay(hung: State) -> None:
-    linear = hung.linear({}, hung.splits.train)
+def test_columns_that_learn_come_as_far_as_columns_that_stay(hung: State, linear: Table) -> None:
     (stays,) = fit(hung.scorer, [hung.model({})], linear, 4, hung.dt)
     learns = descend(hung.scorer, hung.model({}), linear, 4, hung.dt)
     assert stays.chi2 is not None
@@ -90,9 +93,9 @@ def test_columns_that_learn_come_as_far_as_columns_that_stay(hung: State) -> Non
     assert float(log_chi2(learns.chi2).mean()) <= float(log_chi2(stays.chi2).mean()) + 0.003
 
 
-def test_a_settled_model_keeps_columns_as_they_were_measured(hung: State) -> None:
+def test_a_settled_model_keeps_columns_as_they_were_measured(hung: State, linear: Table) -> None:
     once = hung.converged(1)
-    np.testing.assert_array_equal(once.table.columns, hung.linear({}, hung.splits.train).columns)
+    np.testing.assert_array_equal(once.table.columns, linear.columns)
     residual = hung.linear(once.theta, hung.splits.train).residual
     np.testing.assert_allclose(once.table.residual, residual, atol=1e-3 * np.abs(residual).max())
 

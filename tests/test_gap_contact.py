@@ -124,7 +124,8 @@ def test_the_command_refuses_them_and_takes_a_choice(tmp_path: Path) -> None:
     _, soft = recorded("excitation=[squat,drop]")
     _, hard = recorded("excitation=[squat,drop]", "contact=stiff")
     for k, recording in enumerate((*soft, *hard)):
-        write(tmp_path / f"{k}.parquet", replace(recording, meta=replace(recording.meta, episode=f"e{k}")))
+        first_second = {name: values[:500] for name, values in recording.channels.items()}
+        write(tmp_path / f"{k}.parquet", Recording(replace(recording.meta, episode=f"e{k}"), first_second))
     words = ["stage=localise", f"logs={tmp_path}", f"out={tmp_path / 'gap'}", "search.window_s=0.1", "search.threads=1"]
     with pytest.raises(ConfigError, match=r"\(e0, e1: 20 ms, pyramidal, impratio 1; e2, e3: 5 ms"):
         APP.run(words)
@@ -189,15 +190,21 @@ def test_a_hard_robot_is_probed_within_the_bounds_and_a_soft_one_as_before() -> 
     assert levels(replace(STIFF, time_constant=0.004)) == [0.01]
 
 
+def replayer_of(recordings: tuple[Recording, ...], config: RobotConfig, contact: ContactConfig | None) -> Replayer:
+    machine, ready = prepare(recordings, SuspendedGo1(config, contact=contact), QUICK)
+    windows = machine.windows(ready)
+    return machine.replayer(windows, np.tile([1.0, 0, 0, 0], (len(windows), 1)), 512, 1)
+
+
 def test_a_value_is_what_it_says_under_every_contact_and_null_is_continuous() -> None:
     config, recordings = recorded("excitation=[squat,drop]", "contact=stiff")
 
     def replayed(contact: ContactConfig, value: float | None) -> np.ndarray:
-        machine, ready = prepare(recordings, SuspendedGo1(config, contact=contact), QUICK)
-        windows = machine.windows(ready)
-        replayer: Replayer = machine.replayer(windows, np.tile([1.0, 0, 0, 0], (len(windows), 1)), 512, 1)
+        replayer = models[contact]
         theta = {} if value is None else {KEY: np.array([value])}
-        return replayer.run(variants(machine, theta, np.arange(len(windows)), []), 0.001)
+        return replayer.run(variants(replayer.machine, theta, np.arange(len(replayer.windows)), []), 0.001)
+
+    models = {contact: replayer_of(recordings, config, contact) for contact in (STIFF, MUJOCO_CONTACT)}
 
     hard, soft = replayed(STIFF, None), replayed(MUJOCO_CONTACT, None)
     assert replayed(STIFF, 0.005).tobytes() == replayed(STIFF, 0.0).tobytes() == hard.tobytes()
@@ -233,10 +240,7 @@ def test_a_spread_needs_a_value_to_be_about() -> None:
 
 def search_in(recordings: tuple[Recording, ...], config: RobotConfig, contact: ContactConfig | None) -> Search:
     """Return a search that has not begun."""
-    machine, ready = prepare(recordings, SuspendedGo1(config, contact=contact), QUICK)
-    windows = machine.windows(ready)
-    replayer = machine.replayer(windows, np.tile([1.0, 0, 0, 0], (len(windows), 1)), 512, 1)
-    score, _ = converged(replayer, 0.001, 0.00015)
+    score, _ = converged(replayer_of(recordings, config, contact), 0.001, 0.00015)
     rng = np.random.default_rng(0)
     parts = splits([r.meta for r in recordings], score.windows.episode, 0.2, rng)
     return begun(score, parts, QUICK, 0.001, rng)

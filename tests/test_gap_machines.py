@@ -328,14 +328,14 @@ def test_a_held_signal_is_averaged_over_steps() -> None:
 
 
 def played(robot: FixedBase, effects: Mapping[str, Mapping[str, Any]], target: np.ndarray, every: int) -> np.ndarray:
-    """Play targets (K, J), one per 0.5 ms step, on the model with effects; return angles at every so many steps."""
+    """Play targets of N robots (K, N, J), one per 0.5 ms step, on the model with effects; return angles (., N, J)."""
     kp, kd = (0.0, 0.0) if robot.config.drive == "torque" else (3.0, 0.05)
-    plant = at_rest(robot, effects, target[:1], kp, kd, 0.0005)
+    plant = at_rest(robot, effects, target[0], kp, kd, 0.0005)
     found = []
-    for k, row in enumerate(target):
+    for k, row in enumerate(torch.as_tensor(target)):
         if k % every == 0:
-            found.append(plant.q[0].numpy().copy())
-        plant.step(torch.as_tensor(row[None]))
+            found.append(plant.q.numpy().copy())
+        plant.step(row)
     return np.array(found)
 
 
@@ -344,12 +344,12 @@ def swung(
 ) -> list[Recording]:
     """Record the servo that swings its pendulum, ``wide`` rad, by two sines of each speed; noise of 0.2 mrad."""
     steps, logs = np.arange(0.0, seconds, 0.0005), []
-    for n, speed in enumerate(speeds):
-        target = (wide * np.sin(speed * steps) + 0.4 * np.sin(2.3 * speed * steps))[:, None]
-        q = played(robot, effects, target, 10)
-        q += 2e-4 * np.random.default_rng(n).standard_normal(q.shape)
+    phase = steps[:, None] * np.array(speeds)
+    target = (wide * np.sin(phase) + 0.4 * np.sin(2.3 * phase))[..., None]
+    for n, q in enumerate(np.moveaxis(played(robot, effects, target, 10), 1, 0)):
+        noisy = q + 2e-4 * np.random.default_rng(n).standard_normal(q.shape)
         about: dict[str, Any] = {"kp": (3.0,), "kd": (0.05,), "episode": f"e{n}"}
-        logs.append(recording(("pendulum",), steps[::10], {"q": q, "q_target": target[::10]}, **about))
+        logs.append(recording(("pendulum",), steps[::10], {"q": noisy, "q_target": target[::10, n]}, **about))
     return logs
 
 
@@ -456,7 +456,7 @@ def test_friction_hidden_in_a_double_pendulum_of_torque_drives_is_named() -> Non
     steps, logs, joints = np.arange(0.0, 2.5, 0.0005), [], ("shoulder", "elbow")
     for n, speed in enumerate((3.0, 4.0, 6.0)):
         torque = np.stack([0.9 * np.sin(speed * steps), 0.5 * np.sin(1.7 * speed * steps)], 1)
-        q = played(robot, {"coulomb": {"bound": {"elbow": 0.15}}}, torque, 4)
+        q = played(robot, {"coulomb": {"bound": {"elbow": 0.15}}}, torque[:, None], 4)[:, 0]
         q += 2e-4 * np.random.default_rng(n).standard_normal(q.shape)
         about = {"robot": "ak80_double_pendulum_a", "episode": f"e{n}"}
         logs.append(recording(joints, steps[::4], {"q": q, "tau_cmd": torque[::4]}, **about))

@@ -305,13 +305,14 @@ def test_two_clocks_have_a_card_with_the_figures_of_both() -> None:
     both["terms"] = (("coulomb", "armature"), ())
     figures: Any = {name: dict(zip(("recorded", "speeds"), of_each, strict=True)) for name, of_each in both.items()}
     choice = ClockChoice("speeds", True, windows=47, gain=0.52, interval=(0.31, 0.74), p=0.002, **figures)
-    text = Reader(page(replace(answer("explained"), clock=choice))).text
+    explained = answer("explained", overlays=())
+    text = Reader(page(replace(explained, clock=choice))).text
     assert "The times from the speeds are taken: in the median of 47 held-out windows" in text
     assert re.search(r"written times\s+90 to 91.5\s+21.1\s+9.4\s+coulomb, armature", text)
     assert re.search(r"times from the speeds\s+100\s+13.3\s+3.1\s+–", text)
-    assert "time between rows" not in Reader(page(answer("explained"))).text
+    assert "time between rows" not in Reader(page(explained)).text
     alone = ClockChoice("recorded", False, "1 of 4 recordings have no speeds, so there is one clock only")
-    said = Reader(page(replace(answer("explained"), clock=alone))).text
+    said = Reader(page(replace(explained, clock=alone))).text
     assert f"The clocks could not be compared: {alone.reason}. The written times are taken." in said
 
 
@@ -685,7 +686,7 @@ def test_the_status_that_is_printed_is_that_of_the_command(
     certified: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Only what is certified can fail to hold at training's step."""
-    result: GapResult = answer("explained")
+    result: GapResult = answer("explained", overlays=())
     names: tuple[NamedEffect, ...] = tuple(
         replace(n, status="certified" if certified else "compensating") for n in result.named
     )

@@ -153,8 +153,10 @@ class Watched:
     said: list[str]
 
 
-def watched(walking: str, out: Path, monkeypatch: pytest.MonkeyPatch, feet: str | None) -> Watched:
-    """Walk with the shipped policy and raw sensors for three seconds, and keep what its filter took and gave."""
+def watched(
+    walking: str, out: Path, monkeypatch: pytest.MonkeyPatch, feet: str | None, seconds: float = 3.0
+) -> Watched:
+    """Walk with the shipped policy and raw sensors for some seconds, and keep what its filter took and gave."""
     states, velocities, said, worlds = list[LowState](), list[np.ndarray](), list[str](), list[World]()
     update = KalmanEstimator.update
 
@@ -163,7 +165,7 @@ def watched(walking: str, out: Path, monkeypatch: pytest.MonkeyPatch, feet: str 
         velocities.append(update(self, state))
         return velocities[-1]
 
-    plan = Plan(seconds=3.0, stand_up=0.3, lie_down=0.0, brake=0.05, command=CommandConfig((0.8, 0.0, 0.3)))
+    plan = Plan(seconds=seconds, stand_up=0.3, lie_down=0.0, brake=0.05, command=CommandConfig((0.8, 0.0, 0.3)))
     with monkeypatch.context() as patch, lockstep(on_server=worlds.append) as world:
         patch.setattr(KalmanEstimator, "update", listening)
         assert run_job(Job(walking, "sim", plan, str(out), sim=RAW, feet=feet), said.append) == 0, said
@@ -200,7 +202,7 @@ def test_raw_sensors_with_a_calibration_and_torques_tell_contact_better_than_tor
 def test_raw_sensors_without_a_calibration_leave_contact_to_the_torques(
     walking: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    done = watched(walking, tmp_path / "torques", monkeypatch, None)
+    done = watched(walking, tmp_path / "torques", monkeypatch, None, seconds=1.0)
     assert any(line.startswith("foot contact: from joint torques alone; feet=FILE") for line in done.said)
     again = KalmanEstimator(settings(load(walking).metadata.estimator, **TORQUE), lambda *_: None)
     assert np.array([again.update(state) for state in done.states]).tobytes() == done.velocity.tobytes()

@@ -521,7 +521,8 @@ def test_eval_true_evaluates_what_is_missing_with_the_runs_own_policy(tmp_path: 
     run_state.write(tmp_path / "r", "done")
     brief = {"x": [0.5], "y": [], "yaw": [], "episodes": 3, "seconds": 0.2, "settle_s": 0.1}
     changes = [f"evaluation.{key}={value}" for key, value in brief.items()]
-    short = ["robots=2", "first_s=2.0", "every_s=2.0", "jitter_s=0.1", "recovery.hold_s=0.1", "recovery.smooth_s=0.1"]
+    short = ["robots=2", "impulses=[3.0]", "first_s=2.0", "every_s=2.0", "jitter_s=0.1"]
+    short += ["recovery.hold_s=0.1", "recovery.smooth_s=0.1"]
     changes += ["protocol=[grid,kicks]", *(f"protocol.kicks.{words}" for words in short)]
     line = [f"folders=[{tmp_path / 'r'}]", f"folder={tmp_path}/out", *changes]
     with pytest.raises(ConfigError, match=r"protocol=\[kicks\]: is what eval=true plays"):

@@ -22,7 +22,7 @@ import torch
 
 from go1exp.base.paths import data_root
 from go1exp.train import checkpoint, metrics, run_folder, trainer
-from tests.command import COMMAND_LINE
+from tests.command import COMMAND_LINE, refuse
 from tests.command import run as cli
 from tests.small_run import small, train
 
@@ -367,7 +367,7 @@ def test_a_run_with_a_damaged_file_is_refused_with_its_name(
     (killed_copy / file).write_text(text)
     before = contents(killed_copy)
     for words in (("train", f"resume={killed_copy}"), ("eval", f"run={killed_copy}")):
-        done = cli(tmp_path, *words)
+        done = refuse(tmp_path, *words)
         assert done.returncode == 2, done.stderr
         assert "Traceback" not in done.stderr
         assert f"{killed_copy}/{file}: {said}" in done.stderr
@@ -401,7 +401,9 @@ def contents(run: Path) -> dict[str, bytes]:
 
 def test_resume_refuses_changed_settings_and_touches_nothing(killed_copy: Path, tmp_path: Path) -> None:
     before = contents(killed_copy)
-    done = cli(tmp_path, "train", f"resume={killed_copy}", "ppo.iterations=9", "seed=3", "ppo.gamma=0.9", "rand=none")
+    done = refuse(
+        tmp_path, "train", f"resume={killed_copy}", "ppo.iterations=9", "seed=3", "ppo.gamma=0.9", "rand=none"
+    )
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
     for override in ("seed=3", "ppo.gamma=0.9", "rand=none"):
@@ -414,7 +416,7 @@ def test_resume_refuses_changed_settings_and_touches_nothing(killed_copy: Path, 
 def test_the_same_folder_with_other_settings_is_refused_too(killed_copy: Path, tmp_path: Path) -> None:
     """It would go on from the old checkpoint, and config.yaml would no longer say what was run."""
     before = contents(killed_copy)
-    done = cli(tmp_path, "train", *FLAT, SIX, "ppo.gamma=0.9", f"hydra.run.dir={killed_copy}")
+    done = refuse(tmp_path, "train", *FLAT, SIX, "ppo.gamma=0.9", f"hydra.run.dir={killed_copy}")
     assert done.returncode == 2, done.stdout
     assert "ppo.gamma" in done.stderr
     kept = {name: data for name, data in contents(killed_copy).items() if not name.startswith(".hydra")}

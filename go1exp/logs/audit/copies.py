@@ -52,12 +52,6 @@ def _weight(log: Log, kinds: tuple[str, str]) -> Verdict:
     return "suspect" if kinds in (("tau_est", "tau_cmd"), ("tau_est", ""), ("qd", "")) or idle else "bad"
 
 
-def _floor(log: Log, channel: str) -> float:
-    """Return the noise of a measured column with its quantisation; 0 in an ideal simulation."""
-    floor = float(np.hypot(log.noise(channel), log.steps[channel] / np.sqrt(12.0)))
-    return floor if floor > limits.IDEAL * float(np.ptp(log.recording.channels[channel])) else 0.0
-
-
 # ---------------------------------------------------------------------- equal columns
 
 
@@ -67,15 +61,15 @@ def _equal(log: Log, name: str, other: str) -> Iterator[Finding]:
     if "t" in kinds or (kinds[0] == kinds[1] and kinds[0] in COMMANDS) or any(k.startswith("base_") for k in kinds):
         return  # joints may have one command, and a simulator's truth may be its reading
     related = kinds in MEANING
-    ideal = not all(_floor(log, c) for c in (name, other) if log.quantity[c] not in COMMANDS)
+    ideal = not all(log.sensor_noise[c] for c in (name, other) if log.quantity[c] not in COMMANDS)
     if ideal and not related:
         return
-    a, b = (log.recording.channels[c].astype(float) for c in (name, other))
-    span = float(min(np.ptp(a), np.ptp(b)))
+    a, b = (log.recording.channels[c].astype(float, copy=False) for c in (name, other))
+    span = min(log.spans[name], log.spans[other])
     rounding = 0.51 * max(log.steps.get(c, 0.0) for c in (name, other)) if related else 0.0
     close = min(max(rounding, 1e-6 * span), 2e-3 * span)
     for late in (0, 1, -1) if related else (0,):
-        share, count = _shared(a, np.roll(b, late), log.on, close)
+        share, count = _shared(a, np.roll(b, late) if late else b, log.on, close)
         if share > limits.COPIED and count >= limits.ENOUGH * (1.0 if share < limits.DERIVED else 0.2):
             row = f" of the row {'before' if late > 0 else 'after'}" if late else ""
             why = MEANING.get(kinds, "one of the two holds another quantity")
@@ -111,7 +105,8 @@ def _rounded(log: Log, name: str, other: str, a: np.ndarray, b: np.ndarray) -> I
 def _shared(a: np.ndarray, b: np.ndarray, on: np.ndarray, close: float) -> tuple[float, int]:
     """Return the share, and the number, of the ``on`` rows (T,) where two columns change to values that are close."""
     part = slice(1, -1, max(1, len(a) // limits.COPY_ROWS))
-    if np.mean(np.abs(a[part] - b[part]) <= close) < limits.COPIED / 2:
+    near = np.abs(a[part] - b[part]) <= close
+    if np.count_nonzero(near) < limits.COPIED / 2 * len(near):
         return 0.0, 0  # most pairs, by a part of their rows
     changes, other = (np.append(False, np.diff(x) != 0.0) & on for x in (a, b))
     count = int((changes & other & (np.abs(a - b) <= close)).sum())
@@ -135,7 +130,7 @@ class _Source:
     @staticmethod
     def from_log(log: Log, channel: str) -> _Source:
         x = log.recording.channels[channel]
-        return _Source(x, _floor(log, channel), np.append(False, np.diff(x) != 0.0) & log.on)
+        return _Source(x, log.sensor_noise[channel], np.append(False, np.diff(x) != 0.0) & log.on)
 
     def repeated(self, y: np.ndarray, predictions: Iterable[Prediction], step: float = 0.0) -> float:
         """Return the share of rows in which ``y`` (T,), of steps ``step``, is nearer to a prediction than noise."""

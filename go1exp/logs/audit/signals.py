@@ -277,6 +277,17 @@ class Log:
         sigma, white = self.floors[channel]
         return sigma if white else 0.0
 
+    @cached_property
+    def spans(self) -> dict[str, float]:
+        """Range of each known column."""
+        return {c: float(np.ptp(self.recording.channels[c])) for c in self.quantity}
+
+    @cached_property
+    def sensor_noise(self) -> dict[str, float]:
+        """Noise of each measured column with its quantisation; 0 in an ideal simulation."""
+        noise = {c: float(np.hypot(self.noise(c), self.steps[c] / np.sqrt(12.0))) for c in self.measured}
+        return {c: size if size > limits.IDEAL * self.spans[c] else 0.0 for c, size in noise.items()}
+
     def samples(self, seconds: float, least: int = 1) -> int:
         """Return the number of samples in ``seconds``, at least ``least``."""
         return max(least, round(seconds / self.dt))
