@@ -11,7 +11,10 @@ import subprocess
 from collections.abc import Iterable
 from pathlib import Path
 
-ALWAYS = ("pyproject.toml", "requirements/", "Makefile", ".ci/", "tests/conftest.py", "tests/selection.py")
+ALWAYS = (
+    *("pyproject.toml", "requirements/", "Makefile", ".ci/"),
+    *("tests/conftest.py", "tests/fixtures.py", "tests/selection.py"),
+)
 """What every test depends on."""
 
 
