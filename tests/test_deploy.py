@@ -846,20 +846,11 @@ def children(pid: int) -> list[int]:
 
 
 @pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="children are found in Linux's /proc")
-@pytest.mark.parametrize(
-    ("way", "number", "seconds"),
-    [
-        ("go1exp.deploy", signal.SIGTERM, 60.0),
-        ("go1exp", signal.SIGINT, 60.0),
-        *(
-            pytest.param(way, number, 2.0, marks=pytest.mark.slow("go1exp/deploy/", "go1exp/cli/"))
-            for way in ("go1exp.deploy", "go1exp")
-            for number in (signal.SIGINT, signal.SIGTERM)
-        ),
-    ],
-)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("way", ["go1exp.deploy", "go1exp"])
+@pytest.mark.parametrize("seconds", [60.0, pytest.param(2.0, marks=pytest.mark.slow("go1exp/deploy/", "go1exp/cli/"))])
 def test_a_signal_while_the_robot_starts_ends_both_at_once(
-    bundle: str, tmp_path: Path, way: str, number: signal.Signals, seconds: float
+    bundle: str, tmp_path: Path, seconds: float, way: str, number: signal.Signals
 ) -> None:
     arguments = ["deploy", bundle, "out=logs"] if way == "go1exp" else [bundle, "--out", "logs"]
     process, pipe = begun(tmp_path, "-m", way, *arguments)

@@ -267,7 +267,7 @@ def test_the_physics_step_fits_the_rate(rate: float, step: float) -> None:
 
 def test_an_agent_that_cannot_be_put_back_plays_it_all_again(agent: PolicyAgent) -> None:
     """The filter of an estimated velocity cannot: the map is that of kicks on the same walk all the same."""
-    one = play(small("push_map", "trunk_velocity=estimated", "settle_s=0.5", "watch_s=0.3"), agent, Rates(seed=1))
+    one = play(small("push_map", "trunk_velocity=estimated", "watch_s=0.5"), agent, Rates(seed=1))
     assert [row["impulse"] is not None for row in one.played.rows] == [not row["fell"] for row in one.played.rows]
 
 
