@@ -90,7 +90,8 @@ def played(agent: PolicyAgent) -> Callable[[str], tuple[Result, list[str]]]:
             found.append(play(small(name), agent, Rates(seed=1)))
             found[0].chosen.protocol.drawings(found[0].played, found[0].summary)
 
-        left = unread([members("protocol")[name].target], work)
+        kind: Any = members("protocol")[name].target
+        left = unread([kind], work)
         return found[0], left
 
     return cache(once)
