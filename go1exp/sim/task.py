@@ -118,7 +118,7 @@ class ProcessConfig(Strict):
         seed: seed of everything random.
         device: torch device of policy and update, ``auto`` for that of the environment, which is its backend's.
         devices: GPUs of this machine that share the robots and each minibatch; more than 1 needs backend=warp.
-        torch_threads: threads of torch, 0 for its own choice.
+        torch_threads: threads of torch in an update, 0 for its own choice; a rollout takes one.
         resume: run folder to continue; nothing but iterations, checkpoints, threads, devices and backend may change.
         sweep: sweep folder to go on with: its jobs that are not done; launcher, threads and so on may change.
         start_from: run folder, or name of a shipped policy, whose weights a new run begins with.

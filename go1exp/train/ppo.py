@@ -26,6 +26,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from go1exp.base.tensors.threads import one_thread
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.faults import NumericalFault
 from go1exp.sim.env.sb3_env import Go1VecEnv
@@ -276,6 +277,11 @@ class AdaptivePPO(PPO):
             means = self.rollout_buffer.current_means
             mean = self.policy.last_distribution.distribution.mean[: len(means)]  # without mirror images
             return gaussian_kl(means, self._old_log_std, mean, self.policy.log_std).mean()
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> bool:
+        """Collect as SB3 does, with one thread of torch: its idle threads would take cores from the physics."""
+        with one_thread():
+            return super().collect_rollouts(*args, **kwargs)
 
     def train(self) -> None:
         """Update on the rollout, then close the iteration."""
