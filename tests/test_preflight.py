@@ -80,7 +80,7 @@ def test_robots_whose_state_does_not_fit_are_refused_with_the_number_that_does(m
     """Measured with 60,000 robots and two steps: 15.9 kB each, 8.0 kB without randomisation, delay and pushes."""
     monkeypatch.setattr(memory, "free", lambda: 1_000_000_000)
     offered = []
-    for overrides, measured in (([], 15_900), (["experiment=five_minutes"], 8_000)):
+    for overrides, measured in (([], 15_900), (["experiment=minute"], 8_000)):
         with pytest.raises(ConfigError, match=r"^num_envs = 1000000: with 1000000 robots it .* would fit$") as caught:
             go1exp.make(overrides, num_envs=10**6)
         offered.append(int(caught.value.problems[0].split("; ")[1].split()[0]))
