@@ -152,7 +152,7 @@ def fitted_net(place: Place, name: str) -> Path:
 def deployed(run: Path) -> Policy:
     """Return the newest policy of a run as a bundle would hold it: readings in, joint targets and action out."""
     config = parse_train(run_folder.read_config(run))
-    network, _ = load_network(run, config.ppo)
+    network, _ = load_network(run, config)
     module = DeployedPolicy(network, config.task.observation, config.task.action)
 
     def policy(readings: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

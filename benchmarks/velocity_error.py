@@ -28,7 +28,7 @@ SETTLED_S = 2.0
 def errors(run: Path, robots: int, seconds: float, seed: int) -> tuple[np.ndarray, float]:
     """Return the errors (T, N, 3), m/s in the trunk's frame, of the robots that did not fall, and the period, s."""
     config = parse_train(run_folder.read_config(run))
-    policy, _ = load_policy(run, config.ppo)
+    policy, _ = load_policy(run, config)
     sim = dataclasses.replace(config.task.sim, physics_dt=0.002, episode_s=seconds + 1.0, spread_starts=False)
     task = dataclasses.replace(config.task, sim=sim, backend=CpuBackend("cpu", threads=1))
     core = Go1Core(task, robots, seed, imu=True)

@@ -127,7 +127,7 @@ def test_without_one_nothing_has_changed() -> None:
 
 def test_who_runs_the_policy_needs_no_column_of_the_critic(trained: Path) -> None:
     config = parse_train(run_folder.read_config(trained))
-    network, _ = load_network(trained, config.ppo)
+    network, _ = load_network(trained, config)
     core = Go1Core(config.task, 3)
     observation = core.reset()
     with torch.no_grad():

@@ -364,7 +364,7 @@ def by_hand_network(path: Path, observation: np.ndarray) -> np.ndarray:
 def test_a_loaded_policy_is_the_mean_of_the_trained_one(which: int | None, trained: tuple[Path, TrainConfig]) -> None:
     run, config = trained
     path = run / f"checkpoints/{which or 2:06d}.pt"
-    policy, about = load_policy(run, config.ppo, path if which else None)
+    policy, about = load_policy(run, config, path if which else None)
     size = checkpoint.read(path)["policy"]["mlp_extractor.policy_net.0.weight"].shape[1]
     observation = np.random.default_rng(0).normal(size=(5, size))
     got = policy(torch.as_tensor(observation, dtype=torch.float32))
@@ -376,7 +376,7 @@ def test_a_loaded_policy_is_the_mean_of_the_trained_one(which: int | None, train
 def test_a_folder_without_checkpoints_is_named(trained: tuple[Path, TrainConfig], tmp_path: Path) -> None:
     _, config = trained
     with pytest.raises(FileNotFoundError, match=str(tmp_path)):
-        load_policy(tmp_path, config.ppo)
+        load_policy(tmp_path, config)
 
 
 QUIET = EvalConfig(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), episodes=3, seconds=1.0, settle_s=0.4)

@@ -146,7 +146,7 @@ def test_torch_onnx_and_the_environment_agree(choice: str, make_task: Callable[.
 def test_the_trace_is_the_environments(run: Path, good: Bundle) -> None:
     """Played again from outside, with evaluation's policy and the environment's own observations."""
     config = parse_train(run_folder.read_config(run))
-    policy, _ = load_policy(run, config.ppo)
+    policy, _ = load_policy(run, config)
     sim = dataclasses.replace(config.task.sim, spread_starts=False)
     core = Go1Core(dataclasses.replace(config.task, sim=sim), 1, 0, noise=False)
     observation, recorded = core.reset(), []

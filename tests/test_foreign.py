@@ -41,7 +41,7 @@ class InTheirs(nn.Module):
         super().__init__()
         run = data_root() / "assets/policies/paper"
         config = run_folder.read_parsed(run)
-        policy, _ = load_network(run, config.ppo, None)
+        policy, _ = load_network(run, config, None)
         self.net = nn.Sequential(policy.mlp_extractor.policy_net, policy.action_net)
         front = Front(spec, config_of(spec)[1])
         inverse = [spec.names.index(name) for name in robot.JOINTS]

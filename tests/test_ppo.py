@@ -6,7 +6,6 @@ import copy
 import dataclasses
 import math
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -26,7 +25,8 @@ from go1exp.sim.env.sb3_env import Go1VecEnv
 from go1exp.sim.task import PPOConfig, parse_train
 from go1exp.train import trainer
 from go1exp.train.loss import ppo_loss
-from go1exp.train.ppo import AdaptivePPO, GaussianPolicy, adapted_rate, gaussian_kl, linear_rate, policy_settings
+from go1exp.train.network import GaussianPolicy, policy_settings
+from go1exp.train.ppo import AdaptivePPO, adapted_rate, gaussian_kl, linear_rate
 from tests.small_run import small
 
 TINY = small(
@@ -127,7 +127,9 @@ def test_the_divergence_is_that_of_torch_distributions(seed: int) -> None:
 def test_the_value_clip_holds_on_both_sides() -> None:
     config, zero = parse_train(compose("train", ["ppo.value_clip=0.1"])).ppo, torch.zeros(2)
     batch = RolloutBufferSamples(zero, zero[:, None], zero, zero, torch.tensor([1.0, -1.0]), zero)
-    policy: Any = SimpleNamespace(evaluate_actions=lambda o, a: (torch.tensor([[0.5], [-0.7]]), zero, zero))
+    box = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    policy = GaussianPolicy(box, box, lambda _: 1e-3, **policy_settings(config))
+    policy.evaluate_actions = lambda o, a: (torch.tensor([[0.5], [-0.7]]), zero, zero)  # type: ignore[assignment]
     # Values of 0, with returns of 0, have moved to 0.5 and -0.7: they count as 0.1 and -0.1.
     assert float(ppo_loss(policy, batch, config).value) == pytest.approx(0.1**2)
 
@@ -320,9 +322,9 @@ def test_actor_and_critic_are_networks_of_their_own_with_the_configured_layers(n
     policy = slider_ppo("ppo.hidden=[32,16,8]", f"ppo.activation={name}").policy
     actor, critic = policy.mlp_extractor.policy_net, policy.mlp_extractor.value_net
     for net in (actor, critic):
-        linear = [(m.in_features, m.out_features) for m in net if isinstance(m, nn.Linear)]
+        linear = [(m.in_features, m.out_features) for m in net.children() if isinstance(m, nn.Linear)]
         assert linear == [(1, 32), (32, 16), (16, 8)]
-        assert [type(m) for m in net] == [nn.Linear, kind] * 3
+        assert [type(m) for m in net.children()] == [nn.Linear, kind] * 3
     assert (policy.action_net.in_features, policy.action_net.out_features) == (8, 1)
     assert (policy.value_net.in_features, policy.value_net.out_features) == (8, 1)
     observation = torch.linspace(-1, 1, 5).unsqueeze(1)

@@ -105,18 +105,20 @@ def gait(
 
 
 @reward("foot_clock")
-def foot_clock(s: Snapshot, *, rate: Positive = 2.5, height: Positive = 0.06) -> Tensor:
+def foot_clock(s: Snapshot, *, rate: Positive = 2.5, height: Positive = 0.06, excess: Fraction = 1.0) -> Tensor:
     """Feet that follow the clock of observation ``gait_clock`` in a trot: sum of 1/4 - min(|z_i - h_i| / height, 1).
 
     z is the height of the sole over the ground, 0 for one that sinks in; h_i = ``height`` sin^2(p_i) where sin(p_i) > 0
     (swing), else 0; p is the clock's angle for FR and RL, half a turn later for the others. Heights in m. At most 1,
     0 on average for standing feet, so that a fall costs no more than the trot that is missed; as steep there as next to
-    1; 0 while no motion is commanded. Not in Table III; after Siekmann et al., arXiv 2011.01387, heights for forces.
+    1; 0 while no motion is commanded. Of what a swinging foot is higher than h_i the share ``excess`` counts: less than
+    1 lets feet clear steps. Not in Table III; after Siekmann et al., arXiv 2011.01387, heights for forces.
     """
     lift = torch.sin(clock_angle(s, rate)).unsqueeze(-1) * constant_like(DIAGONAL_SIGNS, s.foot_height)
     wanted = lift.clamp(min=0.0).square()
     sole = (s.foot_height - robot.FOOT_RADIUS).clamp(min=0.0) / height
-    following = 1.0 - (sole - wanted).abs().clamp(max=1.0).sum(-1)
+    error = (sole - wanted).abs() * torch.where((wanted > 0.0) & (sole > wanted), excess, 1.0)
+    following = 1.0 - error.clamp(max=1.0).sum(-1)
     return following * (s.command.norm(dim=-1) > 0)
 
 

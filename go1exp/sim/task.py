@@ -33,7 +33,7 @@ from go1exp.config.schema.registry import (
     one_of,
     unknown_name,
 )
-from go1exp.config.schema.training import BESIDE, EVALUATED, EvalDuring, Ramp, StopRule, VideoDuring
+from go1exp.config.schema.training import BESIDE, EVALUATED, EstimatorConfig, EvalDuring, Ramp, StopRule, VideoDuring
 from go1exp.config.schema.training import CheckpointConfig as CheckpointConfig
 from go1exp.config.schema.training import LoggerConfig as LoggerConfig
 from go1exp.config.schema.training import PPOConfig as PPOConfig
@@ -147,6 +147,7 @@ class TrainConfig:
     eval: EvalDuring = BESIDE["eval"]
     video: VideoDuring = BESIDE["video"]
     stop: StopRule = BESIDE["stop"]
+    estimator: EstimatorConfig = BESIDE["estimator"]
     schedule: Mapping[str, Ramp] = field(default_factory=dict)
 
 
@@ -212,6 +213,7 @@ SECTIONS: dict[str, type] = {
     "eval": EvalDuring,
     "video": VideoDuring,
     "stop": StopRule,
+    "estimator": EstimatorConfig,
 }
 """Sections of the configuration that are one dataclass each (of the backend, one for each engine)."""
 
@@ -349,6 +351,8 @@ def _cross_rules(parts: Mapping[str, Any]) -> list[str]:
     if ppo and ppo.symmetry:
         for group in ("observation", "critic"):
             problems += mirror.problems(group, parts.get(group) or ())
+    if (estimator := parts.get("estimator")) and estimator.kind != "none" and not parts.get("critic"):
+        problems.append(f"estimator.kind = {estimator.kind!r}: learns from what the critic sees; use critic=privileged")
     if "observation" in parts and not parts["observation"]:
         problems.append("observation: at least one term is required")
     terrain: Any = parts.get("terrain")

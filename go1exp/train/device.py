@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
 from go1exp import robot
+from go1exp.config.schema.training import EstimatorConfig
 from go1exp.sim.env.engine import captured
 from go1exp.sim.env.faults import NumericalFault
 from go1exp.sim.task import PPOConfig
@@ -32,11 +33,19 @@ class DevicePPO(AdaptivePPO):
     buffer_class: type[RolloutBuffer] = DeviceRolloutBuffer
     rollout_buffer: DeviceRolloutBuffer
 
-    def __init__(self, config: PPOConfig, env: VecEnv, seed: int, device: str, group: Group | None = None) -> None:
+    def __init__(
+        self,
+        config: PPOConfig,
+        env: VecEnv,
+        seed: int,
+        device: str,
+        estimator: EstimatorConfig | None = None,
+        group: Group | None = None,
+    ) -> None:
         # Each new distribution would otherwise look at its parameters, and wait for them.
         torch.distributions.Distribution.set_default_validate_args(False)
         self.group = group or Group()
-        super().__init__(config, env, seed, device)
+        super().__init__(config, env, seed, device, estimator)
 
     def _setup_model(self) -> None:
         super()._setup_model()

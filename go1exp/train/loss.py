@@ -21,7 +21,7 @@ from go1exp.mdp.mirror import ACTION, Mirror, side_by_side
 from go1exp.sim.task import PPOConfig
 
 if TYPE_CHECKING:
-    from stable_baselines3.common.policies import ActorCriticPolicy
+    from go1exp.train.network import GaussianPolicy
 
 
 class Loss(NamedTuple):
@@ -35,9 +35,10 @@ class Loss(NamedTuple):
         clip_fraction: share of samples whose ratio of probabilities left the clip range; without gradient.
         approx_kl: a sampled divergence from the policy that collected the samples (J. Schulman, "Approximating KL
             divergence", 2020); without gradient.
+        estimation: mean square error of the estimator; 0 without one.
 
-    The last two are of the samples that were collected, without their mirror images: an image's ratio says how
-    asymmetric a policy is, not how far it has moved.
+    Clip fraction and divergence are of the samples that were collected, without their mirror images: an image's ratio
+    says how asymmetric a policy is, not how far it has moved.
     """
 
     total: Tensor
@@ -46,10 +47,11 @@ class Loss(NamedTuple):
     entropy: Tensor
     clip_fraction: Tensor
     approx_kl: Tensor
+    estimation: Tensor
 
 
 def ppo_loss(
-    policy: ActorCriticPolicy,
+    policy: GaussianPolicy,
     batch: RolloutBufferSamples,
     config: PPOConfig,
     mirror: SampleMirror | None = None,
@@ -77,12 +79,14 @@ def ppo_loss(
     if config.value_clip is not None:
         values = batch.old_values + (values - batch.old_values).clamp(-config.value_clip, config.value_clip)
     value_loss, entropy_loss = mse_loss(batch.returns, values), -entropy.mean()
+    estimation = policy.mlp_extractor.estimation_loss(batch.observations)
     total = policy_loss + config.entropy * entropy_loss + config.value_coef * value_loss
+    total = total + policy.estimator.weight * estimation
     with torch.no_grad():
         log_ratio, ratio = log_ratio[:collected], ratio[:collected]
         clip_fraction = ((ratio - 1).abs() > config.clip_range).float().mean()
         approx_kl = ((ratio - 1) - log_ratio).mean()
-    return Loss(total, policy_loss, value_loss, entropy_loss, clip_fraction, approx_kl)
+    return Loss(total, policy_loss, value_loss, entropy_loss, clip_fraction, approx_kl, estimation)
 
 
 def write_advantages(

@@ -19,9 +19,10 @@ from go1exp.base.files import write_json
 from go1exp.config.schema import plugins
 from go1exp.config.schema.history import frame_width, frames_of
 from go1exp.config.schema.registry import ConfigError, Term
-from go1exp.sim.task import PPOConfig, TrainConfig
+from go1exp.sim.task import TrainConfig
 from go1exp.train import checkpoint, run_folder
-from go1exp.train.ppo import AdaptivePPO, GaussianPolicy, policy_settings
+from go1exp.train.network import GaussianPolicy, policy_settings
+from go1exp.train.ppo import AdaptivePPO
 
 START = "start.json"
 """In the new run's folder: where its first weights are from."""
@@ -54,6 +55,7 @@ def read_weights(config: TrainConfig, source: Path) -> Weights:
             ("observation", *(_inputs(c.task.observation) for c in (config, theirs))),
             ("critic", *(_inputs(c.task.critic) for c in (config, theirs))),
             ("ppo.hidden", list(config.ppo.hidden), list(theirs.ppo.hidden)),
+            ("estimator", config.estimator, theirs.estimator),
             ("ppo.activation", config.ppo.activation, theirs.ppo.activation),
         )
         if new != old
@@ -108,11 +110,11 @@ def load_run(run: Path, which: Path | None = None) -> tuple[TrainConfig, Policy,
         go1exp.config.schema.registry.ConfigError: if its configuration is not one that this version knows.
     """
     config = run_folder.read_parsed(run)
-    policy, about = load_policy(run, config.ppo, which)
+    policy, about = load_policy(run, config, which)
     return config, policy, about
 
 
-def load_policy(run: Path, config: PPOConfig, which: Path | None = None) -> tuple[Policy, dict[str, Any]]:
+def load_policy(run: Path, config: TrainConfig, which: Path | None = None) -> tuple[Policy, dict[str, Any]]:
     """Load the policy of a run as a function; arguments and errors as ``load_network``'s."""
     network, about = load_network(run, config, which)
     return acting(network), about
@@ -128,12 +130,12 @@ def acting(network: GaussianPolicy) -> Policy:
     return policy
 
 
-def load_network(run: Path, config: PPOConfig, which: Path | None = None) -> tuple[GaussianPolicy, dict[str, Any]]:
+def load_network(run: Path, config: TrainConfig, which: Path | None = None) -> tuple[GaussianPolicy, dict[str, Any]]:
     """Load the network of a run's policy.
 
     Args:
         run: run folder.
-        config: the run's own learner settings, which give the shape of the network.
+        config: the run's own, which gives the shape of the network.
         which: a checkpoint file; the newest if None.
 
     Returns:
@@ -143,12 +145,13 @@ def load_network(run: Path, config: PPOConfig, which: Path | None = None) -> tup
         FileNotFoundError: if there is no checkpoint.
     """
     state, path = (checkpoint.read(which), which) if which else checkpoint.load_latest(run)
-    size, policy_size = (state["policy"][f"mlp_extractor.{net}_net.0.weight"].shape[1] for net in ("value", "policy"))
+    actor = "policy_net" if config.estimator.kind == "none" else "policy_net.encoder"
+    size, policy_size = (state["policy"][f"mlp_extractor.{net}.0.weight"].shape[1] for net in ("value_net", actor))
     network = GaussianPolicy(
         Box(-np.inf, np.inf, (size,), np.float32),
         Box(-1.0, 1.0, (robot.NUM_JOINTS,), np.float32),
         lambda _: 0.0,
-        **policy_settings(config, policy_size if policy_size < size else None),
+        **policy_settings(config.ppo, policy_size if policy_size < size else None, config.estimator),
     )
     network.load_state_dict(state["policy"])
     network.set_training_mode(False)

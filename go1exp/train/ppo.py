@@ -17,9 +17,6 @@ import numpy as np
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import MlpExtractor
 from stable_baselines3.common.type_aliases import RolloutBufferSamples
 from stable_baselines3.common.utils import explained_variance, safe_mean
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
@@ -27,15 +24,17 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from go1exp.base.tensors.threads import one_thread
+from go1exp.config.schema.history import width
+from go1exp.config.schema.training import EstimatorConfig
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.faults import NumericalFault
 from go1exp.sim.env.sb3_env import Go1VecEnv
 from go1exp.sim.task import PPOConfig
 from go1exp.train.group import Group
 from go1exp.train.loss import mirror_of, ppo_loss, write_advantages
+from go1exp.train.network import GaussianPolicy, policy_settings
 from go1exp.train.schedule import Schedule
 
-ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
 KL_FACTOR = 2.0
 """The rate changes when the divergence is off the desired one by this factor (rsl_rl)."""
 RATE_FACTOR = 1.5
@@ -66,84 +65,16 @@ def linear_rate(config: PPOConfig, done: int) -> float:
     return least + left * (config.learning_rate - least)
 
 
-def has_bf16_units() -> bool:
-    """Return whether this processor multiplies bfloat16 matrices in hardware (AVX-512 BF16 or AMX).
-
-    Others emulate it: an update took eight times as long as in float32 on an AMD EPYC with AVX2.
-    """
-    checks = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")  # torch has no public name for them
-    return any(getattr(torch.cpu, check, lambda: False)() for check in checks)
-
-
-def policy_settings(config: PPOConfig, policy_size: int | None = None) -> dict[str, Any]:
-    """Return the keyword arguments of ``GaussianPolicy`` that a configuration stands for."""
-    return {
-        "net_arch": {"pi": list(config.hidden), "vf": list(config.hidden)},
-        "activation_fn": ACTIVATIONS[config.activation],
-        "ortho_init": config.orthogonal_init,
-        "log_std_init": float(np.log(config.init_std)),
-        "bf16": config.matmul_precision == "bf16" or (config.matmul_precision == "auto" and has_bf16_units()),
-        "policy_size": policy_size,
-    }
-
-
-LOSS_FIGURES = ("loss", "policy_gradient_loss", "value_loss", "entropy_loss", "clip_fraction", "approx_kl")
+LOSS_FIGURES = (
+    "loss",
+    "policy_gradient_loss",
+    "value_loss",
+    "entropy_loss",
+    "clip_fraction",
+    "approx_kl",
+    "estimator_loss",
+)
 """SB3's names for the fields of ``Loss``, in their order."""
-
-
-class TwoNetworks(MlpExtractor):
-    """SB3's two networks, of which the actor may see fewer columns, and with bfloat16 as a choice.
-
-    Args:
-        policy_size: the first columns that are the actor's; None for all of them.
-        bf16: multiply matrices in bfloat16 while training; weights and everything else stay float32.
-    """
-
-    def __init__(self, *args: Any, policy_size: int | None, bf16: bool, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self._policy_size, self._bf16 = policy_size, bf16
-        if policy_size is not None:
-            _, *others = args
-            self.policy_net = MlpExtractor(policy_size, *others, **kwargs).policy_net
-
-    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the latents of actor and critic, float32."""
-        if not self._bf16:
-            return super().forward(features)
-        with torch.autocast(features.device.type, torch.bfloat16, enabled=self.training):
-            pi, vf = super().forward(features)
-        return pi.float(), vf.float()
-
-    def forward_actor(self, features: Tensor) -> Tensor:
-        """Return the actor's latent; columns of the critic may be missing."""
-        return super().forward_actor(features[..., : self._policy_size])
-
-
-class GaussianPolicy(ActorCriticPolicy):
-    """SB3's actor-critic, which remembers the distribution of its last forward pass.
-
-    Args:
-        *args: SB3's.
-        policy_size: columns of the observation that the actor sees, the first ones; the critic sees all.
-        bf16: as for ``TwoNetworks``.
-        **kwargs: SB3's.
-    """
-
-    last_distribution: DiagGaussianDistribution
-
-    def __init__(self, *args: Any, policy_size: int | None = None, bf16: bool = False, **kwargs: Any) -> None:
-        self._networks: dict[str, Any] = {"policy_size": policy_size, "bf16": bf16}
-        super().__init__(*args, **kwargs)
-
-    def _build_mlp_extractor(self) -> None:
-        arch, activation, device = self.net_arch, self.activation_fn, self.device
-        self.mlp_extractor = TwoNetworks(self.features_dim, arch, activation, device, **self._networks)
-
-    def _get_action_dist_from_latent(self, latent_pi: Tensor) -> Distribution:
-        distribution = super()._get_action_dist_from_latent(latent_pi)
-        assert isinstance(distribution, DiagGaussianDistribution)
-        self.last_distribution = distribution
-        return distribution
 
 
 class MeanRolloutBuffer(RolloutBuffer):
@@ -209,14 +140,17 @@ class AdaptivePPO(PPO):
     group = Group()
     schedule = Schedule()
 
-    def __init__(self, config: PPOConfig, env: VecEnv, seed: int, device: str) -> None:
+    def __init__(
+        self, config: PPOConfig, env: VecEnv, seed: int, device: str, estimator: EstimatorConfig | None = None
+    ) -> None:
         self.config = config
         self.iteration = 0
         self.after_iteration: Callable[[AdaptivePPO], object] = lambda ppo: None
         terms = env.core.terms if isinstance(env, Go1VecEnv) else None
         assert terms or not config.symmetry, "only a robot's observations have mirror images"
         self.mirror = mirror_of(terms.observed) if config.symmetry and terms else None
-        policy_size = terms.policy_size if terms and terms.policy_size < terms.observation_size else None
+        widths = [width(term) for term in terms.privileged] if terms else []
+        policy_size = terms.policy_size if terms and widths else None
         super().__init__(
             GaussianPolicy,
             env,
@@ -233,7 +167,7 @@ class AdaptivePPO(PPO):
             vf_coef=config.value_coef,
             max_grad_norm=config.max_grad_norm,
             rollout_buffer_class=self.buffer_class,
-            policy_kwargs=policy_settings(config, policy_size),
+            policy_kwargs=policy_settings(config, policy_size, estimator, widths),
             seed=seed,
             device=device,
         )
@@ -326,6 +260,8 @@ class AdaptivePPO(PPO):
         means["clip_range"] = self.config.clip_range
         if self.config.value_clip is not None:
             means["clip_range_vf"] = self.config.value_clip
+        if self.policy.estimator.kind == "none":
+            del means["estimator_loss"]
         for name, value in means.items():
             self.logger.record(f"train/{name}", value)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")

@@ -146,7 +146,7 @@ def build(
         go1exp.config.schema.registry.ConfigError: if its configuration is not one that this version knows.
     """
     config = run_folder.read_parsed(run)
-    network, about = load_network(run, config.ppo, checkpoint)
+    network, about = load_network(run, config, checkpoint)
     module = DeployedPolicy(network, config.task.observation, config.task.action)
     with one_thread():
         model = to_onnx(module)

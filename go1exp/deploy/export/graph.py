@@ -27,7 +27,7 @@ from go1exp.mdp.types import Snapshot
 from go1exp.sim.task import ActionConfig
 
 if TYPE_CHECKING:
-    from go1exp.train.ppo import GaussianPolicy
+    from go1exp.train.network import GaussianPolicy
 
 OPSET = 20
 J = robot.NUM_JOINTS

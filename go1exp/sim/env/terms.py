@@ -174,6 +174,7 @@ class StepTerms:
         left_map: (N,) bool, robots at the edge of the ground in the last step.
         impossible: (N,) bool, robots with an impossible force on a foot in the last step (``mdp/feet.py``).
         distrusts: whether such a force ends an episode.
+        privileged: terms that the critic alone sees.
         observed: terms of the observation, in the order of their columns; those of the critic are the last ones.
         observation_size: O.
         policy_size: columns that are the policy's.
@@ -224,6 +225,7 @@ class StepTerms:
             [part for key, part in self._remembering.items() if key.startswith(f"{group}.")]
             for group in ("observation", "critic")
         )
+        self.privileged = privileged
         self.observed = (*task.observation, *privileged)
         self.read = {name for t in self.observed for name in t.entry.traits.get("reads", ())}
         widths = [width(t) for t in self.observed]
