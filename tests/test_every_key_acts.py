@@ -138,7 +138,7 @@ NEEDS = {
     "command/widening": ["schedule=none"],  # which begins without slow commands
     **{f"contact/{name}": ["schedule=none"] for name in ("elliptic", "soft", "stiff")},  # it begins on soft ground
     "experiment/ablation/no_latency": ["actuator=delay"],
-    **{f"experiment/{part}/no_mirrored_samples": ["ppo=small"] for part in ("ablation", "minute_part")},
+    **{f"experiment/{part}/no_mirrored_samples": ["ppo=small_cpu"] for part in ("ablation", "minute_part")},
     "experiment/minute_part/no_near_kernels": ["experiment=minute"],
     "experiment/study": ["backend=cpu", "ppo=warp"],
     "experiment/robust": ["experiment=clock", "backend=cpu"],
