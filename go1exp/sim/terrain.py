@@ -271,15 +271,33 @@ def _tile(config: TerrainConfig, tile_type: str, row: int, col: int) -> FloatArr
 
 def _unit_obstacles(config: TerrainConfig, along: FloatArray, flat_to: float, rng: np.random.Generator) -> FloatArray:
     """Return blocks on ground at 0, their heights in 0.5..1, the highest 1; none is on the platform or the border."""
-    heights = np.zeros((len(along), len(along)))
     inner = 0.5 * config.tile_size - 1.5 * config.resolution
-    for _ in range(round(OBSTACLES * config.tile_size**2)):
-        centre, half = rng.uniform(-inner, inner, 2), 0.5 * rng.uniform(*OBSTACLE_EDGE, 2)
-        inside = [(np.abs(along - c) <= h) & (np.abs(along) < inner) for c, h in zip(centre, half, strict=True)]
-        heights[np.ix_(*inside)] = rng.uniform(0.5, 1.0)
+    heights = blocks((along, along), (-inner, inner), (-inner, inner), round(OBSTACLES * config.tile_size**2), rng)
     middle = np.abs(along) < flat_to + 1.5 * config.resolution
     heights[np.ix_(middle, middle)] = 0.0
     return heights / (heights.max() or 1.0)
+
+
+def blocks(
+    at: tuple[FloatArray, FloatArray],
+    first: tuple[float, float],
+    second: tuple[float, float],
+    count: int,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Return ``count`` blocks on ground at 0 at samples (n,) and (m,), (n, m), with heights in 0.5..1.
+
+    Their centres, and what is left of them, lie within the bounds of the ``first`` and the ``second`` axis.
+    """
+    heights, bounds = np.zeros((len(at[0]), len(at[1]))), (first, second)
+    for _ in range(count):
+        centre, half = rng.uniform(*np.transpose(bounds)), 0.5 * rng.uniform(*OBSTACLE_EDGE, 2)
+        inside = [
+            (np.abs(v - c) <= h) & (v > low) & (v < high)
+            for v, c, h, (low, high) in zip(at, centre, half, bounds, strict=True)
+        ]
+        heights[np.ix_(*inside)] = rng.uniform(0.5, 1.0)
+    return heights
 
 
 def _unit_boxes(config: TerrainConfig, along: FloatArray, flat_to: float, rng: np.random.Generator) -> FloatArray:

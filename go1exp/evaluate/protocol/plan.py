@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -21,6 +23,9 @@ from go1exp.sim.terrain import TerrainConfig
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+    from go1exp.mdp.types import Snapshot
+    from go1exp.sim.env.plant import Plant
 
 Array = NDArray[np.float64]
 Velocity = tuple[Speed, Speed, Speed]  # x and y in m/s, yaw rate in rad/s, body frame
@@ -112,22 +117,36 @@ class Impulses:
 
 
 @dataclass(frozen=True)
+class Braking:
+    """When motors only brake, as the runtime's do after a fault: torque -kd qd, within the peak torque."""
+
+    tilt: float  # angle of the trunk to the vertical beyond which a robot brakes from then on, rad; pi for never
+    kd: float  # N m s/rad
+
+
+@dataclass(frozen=True)
 class Plan:
     """What N robots are to do."""
 
     command: Array  # (T, N, 3) commanded velocity of each policy step
     impulses: Impulses | None = None  # kicks, or None
     ground: TerrainConfig = dataclasses.field(default_factory=TerrainConfig)  # what they walk on
-    # range of the feet's friction on it, in place of the randomisation's; None keeps that
-    friction: tuple[float, float] | None = None
+    # range of the feet's friction on it, numbers or (N,), in place of the randomisation's; None keeps that
+    friction: tuple[float | Array, float | Array] | None = None
     delay: Array | None = None  # (N,) further command delay, s; None for none
     policy_dt: float | None = None  # period of the policy, s; None keeps that of the stage
     # policy step from which contacts, torques and the like are recorded; None records none
     listen_from: int | None = None
     # turn the robots back into their lanes: yaw rate per rad of heading and per m beside the lane; None does not
     steer: tuple[float, float] | None = None
+    along: float = 1.0  # direction of the lanes along the world's x; -1 for robots that walk backward
+    start: Array | None = None  # (N, 19) where they start, in MuJoCo's order; None starts them as in training
+    falls: bool = True  # whether a fall ends an episode
+    braking: Braking | None = None  # when the motors only brake, or None
+    # (S) -> (N, K): further figures at the end of each policy step, or None
+    figures: Callable[[Snapshot], Tensor] | None = None
     trunk_velocity: TrunkVelocity | None = None  # what the policy sees of it; None keeps that of the stage
-    # way along the world's x, m, after which a robot is done: when all are, or are down, it ends; None plays all steps
+    # way along its lane, m, after which a robot is done: when all are, or are down, it ends; None plays all steps
     finish: float | None = None
 
     @property
@@ -145,12 +164,13 @@ class Motion:
     command: Array  # (T, N, 3) as it was given; x, y in m/s, yaw rate in rad/s
     velocity: Array  # (T, N, 3) of the trunk in its frame: x, y in m/s, yaw rate in rad/s
     height: Array  # (T, N) of the trunk's origin over the ground below it, m
-    way: Array  # (T, N) m along the world's x from the start
+    way: Array  # (T, N) m along the lane from the start
     alive: NDArray[np.bool_]  # (T, N) bool, not fallen and on the map so far
     fell: NDArray[np.bool_]  # (N,) bool
     left_map: NDArray[np.bool_]  # (N,) bool
     front_right: Array  # (T, N) time for which the foot FR has been on the ground, 0 in the air, s
     trace: Trace | None = None  # contacts and the like of the recorded steps, or None
+    figures: Array | None = None  # (T, N, K) those of the plan, or None
 
     @property
     def moving_s(self) -> Array:
@@ -224,6 +244,47 @@ class Kicker:
         force[:, :2] = torch.from_numpy(planar)
         arm = torch.tensor(impulses.point, dtype=quat.dtype).expand(len(quat), 3)
         return torch.cat([force, torch.linalg.cross(arm, rotate_inverse(quat, force))], 1)
+
+
+class Brake:
+    """Lets motors brake and keeps what was largest: in every physics step, before the engine's ``step``.
+
+    Attributes:
+        since: (N,) time at which each robot began to brake, s; infinite before.
+        torque_share: (N,) largest torque of a joint over its peak torque.
+        joint_speed: (N,) largest speed of a joint, rad/s.
+        sink: (N,) largest downward speed of the trunk, m/s.
+    """
+
+    def __init__(self, plant: Plant, physics_dt: float, peak_torque: Array, braking: Braking) -> None:
+        """Begin to act on the steps of ``plant``, whose clock starts now."""
+        self._plant, self._dt, self._kd, self._steps = plant, physics_dt, braking.kd, 0
+        self._peak, self._least = torch.as_tensor(peak_torque), math.cos(braking.tilt)
+        self._inner, backend = plant.backend.step, plant.backend
+        self._state = KinematicState.view(backend.qpos, backend.qvel, None)
+        self.since = torch.full((len(plant.q),), math.inf, dtype=torch.float64)
+        self.clear()
+        backend.step = self._step  # type: ignore[method-assign]
+
+    def clear(self) -> None:
+        """Forget what was largest so far."""
+        self.torque_share, self.joint_speed, self.sink = (torch.zeros_like(self.since) for _ in range(3))
+
+    def _step(self, torque: Tensor) -> None:
+        quat, now = self._state.base_quat_w, self._steps * self._dt
+        upright = 1.0 - 2.0 * (quat[:, 1].square() + quat[:, 2].square())
+        self.since = torch.where(upright < self._least, self.since.clamp(max=now), self.since)
+        braked = torch.minimum(torch.maximum(-self._kd * self._plant.qd, -self._peak), self._peak)
+        made = torch.where(self.since.isfinite().unsqueeze(1), braked, torque)
+        self._plant.torque.copy_(made)
+        self._inner(made)
+        self._steps += 1
+        for name, values in (
+            ("torque_share", (made.abs() / self._peak).amax(-1)),
+            ("joint_speed", self._plant.qd.abs().amax(-1)),
+            ("sink", -self._state.base_lin_vel_w[:, 2]),
+        ):
+            setattr(self, name, torch.maximum(getattr(self, name), values))
 
 
 def phasors(values: ArrayLike, t: ArrayLike, period: float) -> NDArray[np.complex128]:

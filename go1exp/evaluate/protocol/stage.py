@@ -12,15 +12,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from go1exp import robot
+from go1exp.base.tensors.randomness import Stream
 from go1exp.config.schema.physics import BackendConfig, fitting_step
 from go1exp.config.schema.registry import Entry, Term, members
 from go1exp.config.schema.settings import subset
 from go1exp.evaluate.agents import Agent, Progress
 from go1exp.evaluate.controller.types import TrunkVelocity
-from go1exp.evaluate.protocol.plan import STEP_BYTES, Array, Impulses, Kicker, Motion, Plan, heading
+from go1exp.evaluate.protocol.plan import STEP_BYTES, Array, Brake, Impulses, Kicker, Motion, Plan, heading
 from go1exp.evaluate.recorder import Recorder, bytes_per_step
 from go1exp.evaluate.rollout import DELAY, EvalConfig, delayed, evaluation_task, planar_velocity, require_agreement
 from go1exp.mdp.commands import FixedVelocity
+from go1exp.mdp.kinematics import KinematicState
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TaskConfig
 
@@ -108,6 +111,10 @@ class Stage:
         task = dataclasses.replace(evaluation_task(of_agent, config), terrain=plan.ground, command=command)
         if plan.friction is not None:
             task = dataclasses.replace(task, rand=_with_friction(task.rand, plan.friction))
+        if plan.start is not None:
+            task = dataclasses.replace(task, rand=(*task.rand, _starting(plan.start)))
+        if not plan.falls:
+            task = dataclasses.replace(task, termination=())
         return task if plan.delay is None else delayed(task, 0.0)
 
 
@@ -136,6 +143,10 @@ class Session:
         recording = plan.listen_from is not None
         self._recorder = Recorder(self.core, len(plan.command) - (plan.listen_from or 0)) if recording else None
         self._kicker = Kicker(self.core.backend, task.sim.physics_dt, plan.impulses) if plan.impulses else None
+        self.brake: Brake | None = None
+        if plan.braking is not None:
+            peak = robot.per_joint(task.robot.effort_limit)
+            self.brake = Brake(self.core.plant, task.sim.physics_dt, peak, plan.braking)
         if plan.delay is not None:  # before the first reset, which puts effects into force
             late: Tensor = self.core.plant.effects.effects[DELAY].delay
             usual = delay_of_effects(stage.agent.task)
@@ -190,7 +201,7 @@ class Session:
         dt, first = core.task.sim.policy_dt, self.step
         kept: dict[str, np.ndarray] = {name: np.zeros((steps, n)) for name in ("height", "way", "front_right")}
         kept |= {"velocity": np.zeros((steps, n, 3)), "alive": np.zeros((steps, n), bool)}
-        kept["command"], finished = np.zeros((steps, n, 3)), np.zeros(n, bool)
+        kept["command"], finished, figures = np.zeros((steps, n, 3)), np.zeros(n, bool), list[Array]()
         for row in range(steps):
             kept["command"][row] = self._command.value.numpy()
             listening = self._recorder is not None and self.step >= (plan.listen_from or 0)
@@ -203,6 +214,8 @@ class Session:
             if self._recorder and listening:
                 self._recorder.end_step(torch.from_numpy(self._alive))
             self._keep(kept, row)
+            if plan.figures is not None:
+                figures.append(plan.figures(core.snapshot()).double().numpy())
             self.step += 1
             self._stage.count(n)
             if plan.finish is not None and ((kept["way"][row] >= plan.finish) | ~self._alive | finished).all():
@@ -213,7 +226,8 @@ class Session:
                 finished |= kept["way"][row] >= plan.finish
         t = np.asarray((first + 1 + np.arange(len(kept["way"]))) * dt, dtype=np.float64)
         trace = self._recorder.trace(slice(None)) if self._recorder else None
-        return Motion(dt=dt, t=t, fell=self._fell.copy(), left_map=self._left.copy(), trace=trace, **kept)
+        ends = {"fell": self._fell.copy(), "left_map": self._left.copy()}
+        return Motion(dt=dt, t=t, trace=trace, figures=np.array(figures) if figures else None, **ends, **kept)
 
     def _next_command(self) -> Tensor:
         """Return the command (N, 3) of the coming step, in which the state that steering needs is known."""
@@ -223,7 +237,7 @@ class Session:
             command = command.copy()
             qpos = self.core.backend.qpos
             beside = (qpos[:, 1] - self.core.spawn[:, 1]).numpy()
-            turn = -self.plan.steer[0] * heading(qpos[:, 3:7]).numpy() - self.plan.steer[1] * beside
+            turn = -self.plan.steer[0] * heading(qpos[:, 3:7]).numpy() - self.plan.along * self.plan.steer[1] * beside
             command[:, 2] = np.where(np.any(command != 0.0, axis=-1), np.clip(turn, -1.0, 1.0), 0.0)
         return torch.from_numpy(command)
 
@@ -238,7 +252,7 @@ class Session:
         kept["velocity"][row] = planar_velocity(self.core).numpy()
         below = self.core.ground_height(s.base_pos_w[:, :2])
         kept["height"][row] = (s.base_pos_w[:, 2] - below).numpy()
-        kept["way"][row] = s.base_pos_w[:, 0].numpy() - self._start[:, 0]
+        kept["way"][row] = self.plan.along * (s.base_pos_w[:, 0].numpy() - self._start[:, 0])
         kept["alive"][row] = self._alive
         kept["front_right"][row] = s.foot_contact_time[:, 0].numpy()
 
@@ -248,9 +262,21 @@ def delay_of_effects(task: TaskConfig) -> float:
     return sum(float(e.parameters["delay"]) for e in task.effect if e.entry.name == DELAY)
 
 
-def _with_friction(terms: tuple[Term, ...], bounds: tuple[float, float]) -> tuple[Term, ...]:
-    """Return randomisations in which the feet's friction is drawn from ``bounds``."""
+def _with_friction(terms: tuple[Term, ...], bounds: tuple[float | Array, float | Array]) -> tuple[Term, ...]:
+    """Return randomisations in which the feet's friction is drawn from ``bounds``, numbers or (N,)."""
     entry = members("rand")["foot_friction"]
-    parameters = entry.check({"range": list(bounds), "operation": "set"}, "friction")[0]
+    each = tuple(torch.as_tensor(bound, dtype=torch.float32).unsqueeze(-1) for bound in bounds)
     others = tuple(t for t in terms if t.entry.name != entry.name)
-    return (*others, Term("foot_friction", entry, parameters, {"when": "reset"}))
+    return (*others, Term("foot_friction", entry, {"range": each, "operation": "set"}, {"when": "reset"}))
+
+
+def _starting(start: Array) -> Term:
+    """Return a randomisation after which robots start at rest at ``start`` (N, 19), in MuJoCo's order."""
+    given = torch.from_numpy(start)
+
+    def put(state: KinematicState, stream: Stream) -> None:
+        at = KinematicState.view(given, torch.zeros(len(given), 18, dtype=given.dtype))
+        for part in dataclasses.fields(state):
+            getattr(state, part.name).copy_(getattr(at, part.name))
+
+    return Term("start", Entry("rand", "start", put, {"kind": "state"}), {})

@@ -180,7 +180,7 @@ def lines(effects: Mapping[str, Term]) -> dict[str, str]:
 
 HARDEST: dict[GroundName, float] = {
     **{"slope_up": 30.0, "slope_down": 30.0, "stairs_up": 0.25, "stairs_down": 0.25},
-    **{"gravel": 0.15, "waves": 0.4, "boxes": 0.3},
+    **{"gravel": 0.15, "waves": 0.4, "crossed_waves": 0.8, "boxes": 0.3, "obstacles": 0.3},
 }
 """Largest difficulty of each lane, in the unit of ``protocol.ground.UNITS`` (chosen: beyond all shipped policies)."""
 
