@@ -49,6 +49,15 @@ SMALL = {
     "hardware": ("robots=2", "seconds=0.4", "settle_s=0.2", "commands=[[0.5,0.0,0.0]]", "delays_ms=[20.0]"),
     "rate": ("robots=2", "seconds=0.3", "settle_s=0.1", "rates_hz=[50.0,100.0]", "delays_ms=[0.0]"),
     "push_map": ("robots=1", "directions=3", "phases=1", "settle_s=1.0", "watch_s=0.5", "halvings=1"),
+    "recover": (
+        *("robots=2", "settle_s=0.1", "seconds=0.2", "stand.hold_s=0.1", "push.after_s=0.1", "brake.seconds=0.2"),
+        "measures=[stride_rate]",
+    ),
+    "robogauge": (
+        *("robots=1", "frictions=[0.5,1.0]", "move_s=0.2", "stand_s=0.1", "pair_s=0.2", "settle_s=0.1"),
+        "grounds={slope:{lane:slope_up,levels:[1.0,2.0],course:0.5,speed:1.0,seconds:0.2,backward:false}}",
+        "measures=[stride_rate]",
+    ),
     "terrain": (
         *("robots=1", "speeds=[8.0]", "slack=1.0", "grounds={slope_up:[5.0,10.0],gravel:[0.01,0.02]}"),
         "measures=[stride_rate]",
@@ -72,8 +81,8 @@ def agent(make_task: Callable[..., TaskConfig]) -> PolicyAgent:
 
 def small(name: str, *more: str) -> Chosen:
     overrides = [f"++protocol.{name}.{o}" for o in (*SMALL[name], *more)]
-    if name == "terrain":
-        overrides.insert(0, "~protocol.terrain.grounds")
+    if name in ("terrain", "robogauge"):
+        overrides.insert(0, f"~protocol.{name}.grounds")
     (one,), grid = chosen(compose("eval", [f"protocol={name}", *overrides])["protocol"])
     assert not grid
     return one

@@ -67,6 +67,7 @@ class Length:
     settle_s: float = 0.0  # time at its start that does not count, s
     recorded: bool = False  # whether the channels of measures are recorded after it
     policy_dt: float | None = None  # period of their policy, s; None is that of the stage
+    figures: int = 0  # further figures of each policy step
 
 
 @dataclass

@@ -116,12 +116,16 @@ class Impulses:
     point: tuple[float, float, float] = (0.0, 0.0, 0.0)  # where they act, in the trunk's frame from its origin, m
 
 
+NEVER = math.pi  # tilt that no robot exceeds, rad
+
+
 @dataclass(frozen=True)
 class Braking:
-    """When motors only brake, as the runtime's do after a fault: torque -kd qd, within the peak torque."""
+    """When motors only brake, as the runtime's do after a fault, within the peak torque."""
 
-    tilt: float  # angle of the trunk to the vertical beyond which a robot brakes from then on, rad; pi for never
+    tilt: float  # angle of the trunk to the vertical beyond which a robot brakes from then on, rad; NEVER for none
     kd: float  # N m s/rad
+    kp: float = 0.0  # N m/rad, towards the angles at which braking began: with it the legs keep their posture
 
 
 @dataclass(frozen=True)
@@ -251,31 +255,29 @@ class Brake:
 
     Attributes:
         since: (N,) time at which each robot began to brake, s; infinite before.
-        torque_share: (N,) largest torque of a joint over its peak torque.
-        joint_speed: (N,) largest speed of a joint, rad/s.
-        sink: (N,) largest downward speed of the trunk, m/s.
+        torque_share: (N,) largest torque of a joint over its peak torque since then, or ever if none is to brake.
+        joint_speed: (N,) largest speed of a joint in that time, rad/s.
+        sink: (N,) largest downward speed of the trunk in that time, m/s.
     """
 
     def __init__(self, plant: Plant, physics_dt: float, peak_torque: Array, braking: Braking) -> None:
         """Begin to act on the steps of ``plant``, whose clock starts now."""
-        self._plant, self._dt, self._kd, self._steps = plant, physics_dt, braking.kd, 0
+        self._plant, self._dt, self._braking, self._steps = plant, physics_dt, braking, 0
         self._peak, self._least = torch.as_tensor(peak_torque), math.cos(braking.tilt)
-        self._inner, backend = plant.backend.step, plant.backend
-        self._state = KinematicState.view(backend.qpos, backend.qvel, None)
-        self.since = torch.full((len(plant.q),), math.inf, dtype=torch.float64)
-        self.clear()
-        backend.step = self._step  # type: ignore[method-assign]
-
-    def clear(self) -> None:
-        """Forget what was largest so far."""
+        self._always, backend = braking.tilt >= NEVER, plant.backend
+        self._inner, self._state = backend.step, KinematicState.view(backend.qpos, backend.qvel, None)
+        self.since, self._angles = torch.full((len(plant.q),), math.inf, dtype=torch.float64), plant.q.clone()
         self.torque_share, self.joint_speed, self.sink = (torch.zeros_like(self.since) for _ in range(3))
+        backend.step = self._step  # type: ignore[method-assign]
 
     def _step(self, torque: Tensor) -> None:
         quat, now = self._state.base_quat_w, self._steps * self._dt
         upright = 1.0 - 2.0 * (quat[:, 1].square() + quat[:, 2].square())
+        self._angles = torch.where(self.since.isfinite().unsqueeze(1), self._angles, self._plant.q)
         self.since = torch.where(upright < self._least, self.since.clamp(max=now), self.since)
-        braked = torch.minimum(torch.maximum(-self._kd * self._plant.qd, -self._peak), self._peak)
-        made = torch.where(self.since.isfinite().unsqueeze(1), braked, torque)
+        pull = self._braking.kp * (self._angles - self._plant.q) - self._braking.kd * self._plant.qd
+        braked, brakes = torch.minimum(torch.maximum(pull, -self._peak), self._peak), self.since.isfinite()
+        made = torch.where(brakes.unsqueeze(1), braked, torque)
         self._plant.torque.copy_(made)
         self._inner(made)
         self._steps += 1
@@ -284,7 +286,8 @@ class Brake:
             ("joint_speed", self._plant.qd.abs().amax(-1)),
             ("sink", -self._state.base_lin_vel_w[:, 2]),
         ):
-            setattr(self, name, torch.maximum(getattr(self, name), values))
+            counted = values.where(brakes | self._always, 0.0)
+            setattr(self, name, torch.maximum(getattr(self, name), counted))
 
 
 def phasors(values: ArrayLike, t: ArrayLike, period: float) -> NDArray[np.complex128]:

@@ -1,5 +1,29 @@
 """The protocols. Importing the package registers every kind, from this explicit list."""
 
-from go1exp.evaluate.protocol.kinds import corners, energy, gait, hardware, kicks, push_map, rate, sinusoid, terrain
+from go1exp.evaluate.protocol.kinds import (
+    corners,
+    energy,
+    gait,
+    hardware,
+    kicks,
+    push_map,
+    rate,
+    recover,
+    robogauge,
+    sinusoid,
+    terrain,
+)
 
-__all__ = ["corners", "energy", "gait", "hardware", "kicks", "push_map", "rate", "sinusoid", "terrain"]
+__all__ = [
+    "corners",
+    "energy",
+    "gait",
+    "hardware",
+    "kicks",
+    "push_map",
+    "rate",
+    "recover",
+    "robogauge",
+    "sinusoid",
+    "terrain",
+]
