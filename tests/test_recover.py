@@ -65,7 +65,7 @@ def test_robots_lie_on_side_and_back_at_rest_with_joints_all_over_their_range(st
     assert (np.ptp(joints[:6], axis=0) > 0.4 * np.ptp(stops, axis=1)).all()
     np.testing.assert_allclose(np.linalg.norm(start[:, 3:7], axis=1), 1.0)
     braking = Braking(0.0, protocol.hold[1], protocol.hold[0])
-    plan = Plan(np.zeros((100, 12, 3)), start=start, falls=False, braking=braking, figures=posture)
+    plan = Plan(np.zeros((100, 12, 3)), start=start, terminations=(), braking=braking, figures=posture)
     motion = stage.run(plan)
     assert motion.figures is not None
     np.testing.assert_allclose(motion.figures[0, :6, 0], 0.5 * np.pi, atol=0.1)
@@ -81,7 +81,7 @@ def test_motors_that_brake_make_no_other_torque_than_the_runtimes(stage: Stage) 
     start[1, 2:7] = [0.4, np.cos(0.6), np.sin(0.6), 0.0, 0.0]  # rolled by 1.2 rad
     kd = SafetyConfig().damping_kd
     session = stage.session(
-        Plan(np.zeros((4, 2, 3)), start=start, falls=False, braking=Braking(SafetyConfig().tilt, kd))
+        Plan(np.zeros((4, 2, 3)), start=start, terminations=(), braking=Braking(SafetyConfig().tilt, kd))
     )
     seen: list[tuple[np.ndarray, np.ndarray]] = []
     plant, inner = session.core.plant, session.brake._inner  # type: ignore[union-attr]
@@ -129,7 +129,7 @@ SHORT = (
 
 def test_never_is_a_tilt_that_nothing_exceeds(stage: Stage) -> None:
     start = np.r_[0.0, 0.0, 0.3, 0.0, 1.0, 0.0, 0.0, robot.NOMINAL_STANCE][None]
-    session = stage.session(Plan(np.zeros((2, 1, 3)), start=start, falls=False, braking=Braking(NEVER, 2.0)))
+    session = stage.session(Plan(np.zeros((2, 1, 3)), start=start, terminations=(), braking=Braking(NEVER, 2.0)))
     session.run(2)
     assert session.brake is not None
     assert session.brake.since.isinf().all()

@@ -20,6 +20,7 @@ from go1exp.evaluate.protocol.base import chosen
 from go1exp.evaluate.protocol.grading import (
     CHANNELS,
     METRICS,
+    Graded,
     channels,
     highest_level,
     metrics,
@@ -28,7 +29,7 @@ from go1exp.evaluate.protocol.grading import (
     worse_half,
 )
 from go1exp.evaluate.protocol.ground import Lanes
-from go1exp.evaluate.protocol.kinds.robogauge import Graded, RoboGauge
+from go1exp.evaluate.protocol.kinds.robogauge import RoboGauge
 from go1exp.evaluate.protocol.plan import Motion, Plan
 from go1exp.evaluate.protocol.playing import Rates, play
 from go1exp.evaluate.protocol.stage import Setting, Stage
@@ -131,24 +132,21 @@ def test_the_score_is_a_tenth_a_level() -> None:
     assert score(0, 1.0) == 0.0
 
 
-def rows(protocol: RoboGauge, levels: dict[str, tuple[int, int]], worst: float) -> list[dict[str, Any]]:
+def rows(levels: dict[str, tuple[int, int]], worst: float) -> list[dict[str, Any]]:
     """Rows of two robots with a friction each, which pass up to their level and have one quality everywhere."""
     made_rows: list[dict[str, Any]] = []
     for n, friction in enumerate((0.4, 0.8)):
+        who = {"friction": friction, "robot": n}
         for name, of_robot in levels.items():
-            about = {"ground": name, "friction": friction, "robot": n}
-            for level in range(1, 11):
-                made_rows.append({**about, "level": level, "passed": level <= of_robot[n]})
-            if of_robot[n]:
-                made_rows.append({**about, "level": of_robot[n], "passed": None, "quality_worst": worst})
-        flat = {"ground": "flat", "friction": friction, "robot": n, "level": 0}
-        made_rows.append({**flat, "passed": None, "quality_worst": worst})
+            passed = {f"level_{k}": k <= of_robot[n] for k in range(1, 11)}
+            made_rows.append({**who, "ground": name, **passed, "quality_worst": worst if of_robot[n] else None})
+        made_rows.append({**who, "ground": "flat", "quality_worst": worst})
     return made_rows
 
 
 def test_the_table_of_fixed_figures_has_the_score_by_hand() -> None:
     protocol: RoboGauge = made().protocol
-    fixed = rows(protocol, {"waves": (4, 0), "obstacles": (2, 8)}, 0.5)
+    fixed = rows({"waves": (4, 0), "obstacles": (2, 8)}, 0.5)
     figures = {(d.name, d.condition.get("ground")): d for d in protocol.derived(fixed)}
 
     def of(name: str, ground: str | None) -> float:
@@ -247,7 +245,9 @@ def test_who_passes_follows_the_commands_in_the_middle_of_the_highest_level(
     assert (np.abs(followed.command).max((0, 1)) == (1.0, 1.0, 1.5)).all()
     assert (np.abs(flat.command).max((0, 1)) == (1.0, 1.0, 1.0)).all()
     assert (followed.command[:10] == 0.0).all()
-    (row,) = [r for r in result.played.rows if r["task"] == "slope commands"]
+    (row, other) = [r for r in result.played.rows if r["ground"] == "slope"]
+    assert (row["level_1"], row["level_2"], other["level_1"]) == (True, True, False)
+    assert (row["fell"], other["fell"], other.get("quality_worst")) == (False, None, None)
     (found,) = [
         e["figures"]["score"]
         for e in result.summary

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -10,9 +11,12 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from go1exp import robot
-from go1exp.evaluate.protocol.plan import Array
+from go1exp.evaluate.protocol.plan import Array, Motion
+from go1exp.evaluate.quantities import FINGERPRINT, Row
+from go1exp.mdp.measures.trace import mean_over
 from go1exp.mdp.types import Snapshot
 
+SAMPLE = 0.1  # time between two samples of the metrics, s
 POWER, TORQUE = 100.0, 30.0  # root mean squares over joints that score 0: of power, W, and of torque changes, N m
 SOFT = 0.4  # share of the range of hips and thighs, about its middle, that costs nothing
 LEAST = 1e-9  # of a metric in the geometric mean
@@ -96,3 +100,52 @@ def highest_level(shares: Sequence[float], enough: float) -> int:
 def score(level: int, worst: float) -> float:
     """Return the score of a level and of the quality there: 1 for ten levels and a quality of 1."""
     return PER_LEVEL * (level - 1) + OF_QUALITY * worst if level else 0.0
+
+
+@dataclass(frozen=True)
+class Subtask:
+    """A command and what follows it."""
+
+    group: str  # samples of one group are ordered together
+    command: tuple[float, float, float]  # x m/s, y m/s, yaw rad/s
+    until: float  # s
+    then: float  # factor of the command from then on
+    length: float  # s
+
+
+class Graded:
+    """Metrics and quality of a batch, sampled ten times a second after settling."""
+
+    def __init__(self, motion: Motion, largest: Sequence[float], settle_s: float) -> None:
+        assert motion.figures is not None
+        every, first = max(1, round(SAMPLE / motion.dt)), round(settle_s / motion.dt)
+        at = slice(first + every - 1, None, every)
+        self._motion, self._t = motion, motion.t[at] - settle_s
+        self._alive = motion.alive[at]
+        self._metrics = metrics(motion.figures[at], motion.command[at], largest)
+        self._quality = np.where(self._alive, quality(self._metrics), 0.0)
+
+    def row(self, parts: Sequence[tuple[int, Subtask]]) -> Row:
+        """Return the row of one robot from its sub-tasks, each with the robot of the batch that did it, in order."""
+        qualities: dict[str, list[Array]] = {}
+        counts = np.zeros_like(self._alive)
+        for i, part in parts:
+            during = self._t <= part.length + 1e-6
+            qualities.setdefault(part.group, []).append(self._quality[during, i])
+            counts[:, i] = self._alive[:, i] & during
+        pooled = [np.concatenate(each) for each in qualities.values()]
+        robots = [i for i, _ in parts]
+        graded = mean_over(self._metrics[:, robots].reshape(-1, 1, len(METRICS)), counts[:, robots].reshape(-1, 1))[0]
+        row: Row = {"quality": float(np.mean([each.mean() for each in pooled]))}
+        row["quality_worst"] = float(np.mean([worse_half(each) for each in pooled]))
+        row |= {name: float(v) if np.isfinite(v) else None for name, v in zip(METRICS, graded, strict=True)}
+        return row | self._life(robots)
+
+    def _life(self, robots: Sequence[int]) -> Row:
+        """Return falls and times of the sub-tasks one after the other, until the first that ended early."""
+        fell, left = self._motion.fell[robots], self._motion.left_map[robots]
+        ended = np.flatnonzero(fell | left)
+        until = int(ended[0]) + 1 if len(ended) else len(robots)
+        moving, marks = self._motion.moving_s[robots][:until], self._motion.fingerprint[robots]
+        life = {"fell": bool(fell[:until].any()), "left_map": bool(left[:until].any())}
+        return life | {"moving_s": round(float(moving.sum()), 4), FINGERPRINT: float(marks.sum())}

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from go1exp.base.tensors.rotation import rotate_inverse
-from go1exp.config.schema.registry import NonNegative, Positive, Speed, within
+from go1exp.config.schema.registry import NonNegative, Positive, Speed, Term, within
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.controller.types import TrunkVelocity
 from go1exp.mdp.kinematics import KinematicState
@@ -145,7 +145,7 @@ class Plan:
     steer: tuple[float, float] | None = None
     along: float = 1.0  # direction of the lanes along the world's x; -1 for robots that walk backward
     start: Array | None = None  # (N, 19) where they start, in MuJoCo's order; None starts them as in training
-    falls: bool = True  # whether a fall ends an episode
+    terminations: tuple[Term, ...] | None = None  # what counts as a fall; None keeps those of training
     braking: Braking | None = None  # when the motors only brake, or None
     # (S) -> (N, K): further figures at the end of each policy step, or None
     figures: Callable[[Snapshot], Tensor] | None = None

@@ -116,8 +116,8 @@ class Stage:
             task = dataclasses.replace(task, rand=_with_friction(task.rand, plan.friction))
         if plan.start is not None:
             task = dataclasses.replace(task, rand=(*task.rand, _starting(plan.start)))
-        if not plan.falls:
-            task = dataclasses.replace(task, termination=())
+        if plan.terminations is not None:
+            task = dataclasses.replace(task, termination=plan.terminations)
         return task if plan.delay is None else delayed(task, 0.0)
 
 

@@ -157,7 +157,7 @@ class Recover(Protocol):
         count, (kp, kd) = len(LYING) * self.robots, self.hold
         nothing = np.zeros((len(stage.times(self.settle_s)), count, 3))
         start = np.stack([self._lying(stage, n) for n in range(count)])
-        dropped: dict[str, Any] = {"start": start, "falls": False, "figures": posture}
+        dropped: dict[str, Any] = {"start": start, "terminations": (), "figures": posture}
         drop = stage.session(Plan(nothing, **dropped, braking=Braking(0.0, kd, kp)))
         figures = drop.run(len(nothing)).figures
         assert figures is not None
@@ -197,7 +197,7 @@ class Recover(Protocol):
         kick = Impulses(*each, sides, self.push.push_s)
         command = np.repeat(self.command.at(t)[:, None], n, 1)
         braking = Braking(self.brake.tilt, self.brake.kd)
-        session = stage.session(Plan(command, impulses=kick, falls=False, braking=braking, figures=posture))
+        session = stage.session(Plan(command, impulses=kick, terminations=(), braking=braking, figures=posture))
         motion = session.run(len(t))
         brake = session.brake
         assert brake is not None

@@ -12,7 +12,7 @@ The metrics are those of the first version, by which DreamWaQ, HIM and MoE-CTS w
 friction and of the zero-moment point. Ranges of joints are the Go1's; 100 W and 30 N m are as published. Chosen:
 
 - plan of the blocks (that of ``terrain=steps``) and length of the waves: no readable file is published;
-- a fall is that of the policy's task, not only a trunk turned over, and what a robot would do after it counts 0;
+- what a robot that is turned over would do in the rest of a sub-task counts 0, where the published leaves it out;
 - a robot keeps one delay, where the published draws one in every step; it adds to that of the robot of training;
 - every level is walked, so that each has its share and interval.
 """
@@ -20,7 +20,6 @@ friction and of the zero-moment point. Ranges of joints are the Go1's; 100 W and
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -30,22 +29,13 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from go1exp.base.report import plots
-from go1exp.config.schema.registry import NonNegative, Positive, protocol
+from go1exp.config.schema.registry import NonNegative, Positive, bind_list, protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, lives, repeated
-from go1exp.evaluate.protocol.grading import (
-    CHANNELS,
-    METRICS,
-    channels,
-    highest_level,
-    metrics,
-    quality,
-    score,
-    worse_half,
-)
+from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, repeated
+from go1exp.evaluate.protocol.grading import CHANNELS, METRICS, Graded, Subtask, channels, highest_level, score
 from go1exp.evaluate.protocol.ground import GroundName, Lanes
 from go1exp.evaluate.protocol.kinds.rate import LATEST_MS
-from go1exp.evaluate.protocol.plan import Array, Motion, Plan
+from go1exp.evaluate.protocol.plan import NEVER, Array, Plan
 from go1exp.evaluate.quantities import (
     FINGERPRINT,
     ROBOT,
@@ -54,16 +44,16 @@ from go1exp.evaluate.quantities import (
     Row,
     Summaries,
     Summary,
+    about,
     by_condition,
     values,
 )
-from go1exp.mdp.measures.trace import mean_over
 
 if TYPE_CHECKING:
     from go1exp.evaluate.protocol.stage import Stage
 
 FLAT = "flat"
-SAMPLE = 0.1  # time between two samples of the metrics, s
+LEVEL = "level_"  # first part of the names of the columns with whether a robot passed a level, 1 for the first
 STEER = (1.5, 0.5)  # yaw rate with which a robot is turned back, per rad of heading and per m beside its lane
 PATCH, PATCH_WIDTH = 13.0, 14.0  # length and width of the ground on which commands are followed, m: 5 m to each side
 PUBLISHED = {"MoE-CTS": 0.68, "HIM": 0.52, "DreamWaQ": 0.48}  # policies for a Go2
@@ -93,17 +83,6 @@ class Assessed:
     backward: bool
 
 
-@dataclass(frozen=True)
-class Subtask:
-    """A command and what follows it."""
-
-    group: str  # samples of one group are ordered together
-    command: tuple[float, float, float]  # x m/s, y m/s, yaw rad/s
-    until: float  # s
-    then: float  # factor of the command from then on
-    length: float  # s
-
-
 @protocol("robogauge")
 @settings
 class RoboGauge(Protocol):
@@ -112,6 +91,7 @@ class RoboGauge(Protocol):
     Attributes:
         frictions: of the feet; as many robots for each.
         delay_ms: largest further command delay; evenly spread over the robots.
+        fall_tilt: angle of the trunk to the vertical from which on a robot has fallen, whatever its training says, rad.
         pass_share: of the robots that must come to the end of a level.
         ground_seed: of the random heights.
         flat: largest commands on flat ground: x m/s, y m/s, yaw rad/s.
@@ -125,6 +105,7 @@ class RoboGauge(Protocol):
 
     frictions: Annotated[tuple[Annotated[float, Field(gt=0, le=10)], ...], Field(min_length=1)]
     delay_ms: Annotated[float, Field(ge=0, le=LATEST_MS)]
+    fall_tilt: Annotated[float, Field(gt=0, lt=NEVER)]
     pass_share: Share
     ground_seed: Annotated[int, Field(ge=0)]
     flat: Largest
@@ -136,10 +117,12 @@ class RoboGauge(Protocol):
     grounds: dict[str, Assessed | None]
 
     identical: ClassVar[bool] = False
-    keys: ClassVar[tuple[str, ...]] = ("task",)
+    keys: ClassVar[tuple[str, ...]] = ("ground",)
     derived_names: ClassVar[tuple[str, ...]] = ("level", "score", "overall_level", "overall_score")
     robot_columns: ClassVar[tuple[Column, ...]] = (
-        Column("passed", "", "came to the end of the level in time, without a fall", "share", "higher"),
+        Column(
+            "levels", "", "number of levels of which a robot came to the end in time, without a fall", better="higher"
+        ),
         Column("quality_worst", "", "quality over the worse half of the time", better="higher"),
         Column("quality", "", "geometric mean of the six metrics over time; 0 after a fall", better="higher"),
         *(Column(name, "", f"{meaning}; until a fall", better="higher") for name, (_, meaning) in METRICS.items()),
@@ -185,11 +168,10 @@ class RoboGauge(Protocol):
             Cause("move_s", self.move_s, fitting=lambda seconds: seconds - self.settle_s - self.stand_s),
             Cause("pair_s", self.pair_s, fitting=lambda seconds: seconds - self.settle_s),
         ]
-        commands = Length(self.longest, count, causes, self.settle_s, figures=CHANNELS)
+        commands = Length(self.longest, count, causes, self.settle_s, bool(self.terms()), figures=CHANNELS)
         for name, one in self.assessed.items():
             cause = Cause(f"grounds.{name}.seconds", one.seconds)
-            levels = Length(one.seconds, self.count * len(one.levels), [cause], recorded=bool(self.terms()))
-            lengths += [levels, commands]
+            lengths += [Length(one.seconds, self.count * len(one.levels), [cause]), commands]
         return [*lengths, commands]
 
     def play(self, stage: Stage) -> Played:
@@ -198,36 +180,36 @@ class RoboGauge(Protocol):
         for name, one in self.assessed.items():
             walked = self._walk(stage, name, one)
             levels = _levels(walked, self.pass_share)
-            rows += walked + self._follow(stage, name, one, [levels[friction] for friction in self.frictions])
-        rows += self._follow(stage, FLAT, None, [0] * len(self.frictions))
+            followed = self._follow(stage, one, [levels[friction] for friction in self.frictions])
+            rows += [row | followed.get(n, {}) for n, row in enumerate(walked)]
+        rows += [self._who(FLAT, n) | row for n, row in self._follow(stage, None, [0] * len(self.frictions)).items()]
         found = _overall(rows, _score, self.pass_share), _overall(rows, _level, self.pass_share)
         others = ", ".join(f"{who} {value:g}" for who, value in PUBLISHED.items())
         note = f"Score {found[0]:.3f}, mean level {found[1]:.1f}. Published for a Go2 in another simulation: {others}."
         return Played(rows, {}, [note])
 
     def _walk(self, stage: Stage, name: str, one: Assessed) -> list[Row]:
-        """Return a row for each robot and level: robot i of the batch walks lane i modulo the number of levels."""
+        """Return a row for each robot with the levels that it passed; robot i of the batch walks lane i modulo them."""
         seed, levels, along = self.ground_seed, len(one.levels), -1.0 if one.backward else 1.0
         lanes = Lanes(ground=one.lane, levels=one.levels, course=one.course, backward=one.backward, seed=seed)
         robots = np.arange(self.count * levels) // levels
         command = np.tile([along * one.speed, 0.0, 0.0], (len(stage.times(one.seconds)), len(robots), 1))
-        listen = 0 if self.terms() else None
-        way: dict[str, Any] = {"steer": STEER, "along": along, "finish": lanes.goal, "listen_from": listen}
+        way: dict[str, Any] = {"steer": STEER, "along": along, "finish": lanes.goal}
         motion = stage.run(Plan(command, ground=lanes, **way, **self._conditions(robots)))
-        passed = ((motion.way >= lanes.goal) & motion.alive).any(0)
-        rows = lives(motion)
-        for i, row in enumerate(rows):
-            level = i % levels + 1
-            row |= {"task": f"{name} level {level}", "ground": name, "level": level, "passed": bool(passed[i])}
-            row |= self._who(int(robots[i])) | ({"fell": False, "left_map": False} if passed[i] else {})
-        self.measure(motion, rows)
+        passed = ((motion.way >= lanes.goal) & motion.alive).any(0).reshape(self.count, levels)
+        marks = motion.fingerprint.reshape(self.count, levels).sum(1)
+        rows = []
+        for n, each in enumerate(passed.tolist()):
+            row = self._who(name, n) | {f"{LEVEL}{k}": of_level for k, of_level in enumerate(each, 1)}
+            nothing: Row = {"fell": None, "left_map": None, "moving_s": 0.0, FINGERPRINT: float(marks[n])}
+            rows.append(row | nothing | {"levels": sum(each)})
         return rows
 
-    def _follow(self, stage: Stage, name: str, one: Assessed | None, levels: Sequence[int]) -> list[Row]:
-        """Return a row over all sub-tasks for each robot whose friction has a level; on flat ground for every robot."""
+    def _follow(self, stage: Stage, one: Assessed | None, levels: Sequence[int]) -> dict[int, Row]:
+        """Return by robot a row over all sub-tasks, where its friction has a level; on flat ground of every robot."""
         taken = [k for k, level in enumerate(levels) if level or one is None]
         if not taken:
-            return []
+            return {}
         largest = self.uneven if one else self.flat
         subtasks = self.subtasks(largest)
         # Robot i of the batch has patch, and friction, i modulo their number.
@@ -235,23 +217,26 @@ class RoboGauge(Protocol):
         robots = np.array(taken)[patch] * self.robots + number
         command = np.stack([self._signal(stage, s) for s in subtasks], 1)[:, task]
         ground: dict[str, Any] = {"ground": self._patches(one, [levels[k] for k in taken])} if one else {}
-        motion = stage.run(Plan(command, figures=channels, **ground, **self._conditions(robots)))
-        graded = Graded(motion, largest, self.settle_s)
-        rows = []
+        listen = stage.steps(self.settle_s) if self.terms() else None
+        ways: dict[str, Any] = {"figures": channels, "listen_from": listen, **ground, **self._conditions(robots)}
+        motion = stage.run(Plan(command, **ways))
+        graded, measured = Graded(motion, largest, self.settle_s), [Row() for _ in robots]
+        self.measure(motion, measured)
+        rows = {}
         for n in np.unique(robots).tolist():
             parts = [(int(i), subtasks[task[i]]) for i in np.flatnonzero(robots == n)]
-            about = {"task": f"{name} commands", "ground": name, "level": levels[n // self.robots], "passed": None}
-            rows.append(graded.row(parts) | about | self._who(n))
+            rows[n] = graded.row(parts) | measured[parts[0][0]]
         return rows
 
-    def _who(self, n: int) -> Row:
-        return {ROBOT: n, "friction": self.frictions[n // self.robots]}
+    def _who(self, ground: str, n: int) -> Row:
+        return {"ground": ground, ROBOT: n, "friction": self.frictions[n // self.robots]}
 
     def _conditions(self, robots: NDArray[np.intp]) -> dict[str, Any]:
-        """Return friction and delay of each robot of a batch."""
+        """Return friction, delay and falls of the robots of a batch."""
         friction = np.array(self.frictions)[robots // self.robots]
         delay = 1e-3 * self.delay_ms * (robots % self.robots + 0.5) / self.robots
-        return {"friction": (friction, friction), "delay": delay}
+        fall = bind_list("termination", [{"tilt": {"max_angle": self.fall_tilt}}], "fall_tilt")
+        return {"friction": (friction, friction), "delay": delay, "terminations": tuple(fall)}
 
     def _patches(self, one: Assessed, levels: Sequence[int]) -> Lanes:
         """Return ground with its start in the middle of the difficulty, one patch for each of the ``levels``."""
@@ -288,65 +273,23 @@ class RoboGauge(Protocol):
         return [plots.Drawing("score", "Score by ground", text, partial(_draw_scores, summaries))]
 
     def details(self, played: Played, summary: Summary) -> list[plots.Drawing]:
-        """Draw the levels over friction."""
-        levels = {name: _levels(rows, self.pass_share) for name, rows in _walked(played.rows).items()}
-        text = "Highest level passed over the friction of the feet."
-        return [plots.Drawing("levels", "Level over friction", text, partial(_draw_levels, levels))] if levels else []
+        """Draw who passed which level, and the levels over friction."""
+        of_grounds = {name: about(played.rows, {"ground": name}) for name in self.assessed}
+        text = "Left: share of all robots that passed. Right: highest level passed, over the friction of the feet."
+        levels = plots.Drawing("levels", "Levels", text, partial(_draw_levels, of_grounds, self.pass_share))
+        return [levels] if of_grounds else []
 
 
-class Graded:
-    """Metrics and quality of a batch, sampled ten times a second after settling."""
-
-    def __init__(self, motion: Motion, largest: Sequence[float], settle_s: float) -> None:
-        assert motion.figures is not None
-        every, first = max(1, round(SAMPLE / motion.dt)), round(settle_s / motion.dt)
-        at = slice(first + every - 1, None, every)
-        self._motion, self._t = motion, motion.t[at] - settle_s
-        self._alive = motion.alive[at]
-        self._metrics = metrics(motion.figures[at], motion.command[at], largest)
-        self._quality = np.where(self._alive, quality(self._metrics), 0.0)
-
-    def row(self, parts: Sequence[tuple[int, Subtask]]) -> Row:
-        """Return the row of one robot from its sub-tasks, each with the robot of the batch that did it, in order."""
-        qualities: dict[str, list[Array]] = {}
-        counts = np.zeros_like(self._alive)
-        for i, part in parts:
-            during = self._t <= part.length + 1e-6
-            qualities.setdefault(part.group, []).append(self._quality[during, i])
-            counts[:, i] = self._alive[:, i] & during
-        pooled = [np.concatenate(each) for each in qualities.values()]
-        robots = [i for i, _ in parts]
-        graded = mean_over(self._metrics[:, robots].reshape(-1, 1, len(METRICS)), counts[:, robots].reshape(-1, 1))[0]
-        row: Row = {"quality": float(np.mean([each.mean() for each in pooled]))}
-        row["quality_worst"] = float(np.mean([worse_half(each) for each in pooled]))
-        row |= {name: float(v) if np.isfinite(v) else None for name, v in zip(METRICS, graded, strict=True)}
-        return row | self._life(robots)
-
-    def _life(self, robots: Sequence[int]) -> Row:
-        """Return falls and times of the sub-tasks one after the other, until the first that ended early."""
-        fell, left = self._motion.fell[robots], self._motion.left_map[robots]
-        ended = np.flatnonzero(fell | left)
-        until = int(ended[0]) + 1 if len(ended) else len(robots)
-        moving, marks = self._motion.moving_s[robots][:until], self._motion.fingerprint[robots]
-        life = {"fell": bool(fell[:until].any()), "left_map": bool(left[:until].any())}
-        return life | {"moving_s": round(float(moving.sum()), 4), FINGERPRINT: float(marks.sum())}
-
-
-def _walked(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Return the rows of levels by ground."""
-    return {
-        str(k[0]): those for k, those in by_condition([r for r in rows if r["passed"] is not None], ("ground",)).items()
-    }
+def _passes(rows: Sequence[Row]) -> NDArray[np.float64]:
+    """Return which levels (L) the robots (N) of one ground passed, (N, L) of 0 and 1; no levels on flat ground."""
+    names = [name for name in rows[0] if name.startswith(LEVEL)] if rows else []
+    return np.array([[row[name] for name in names] for row in rows], dtype=np.float64).reshape(len(rows), len(names))
 
 
 def _levels(rows: Sequence[Row], share: float) -> dict[float, int]:
-    """Return the highest level passed by friction, of one ground's rows."""
-    found = {}
-    for (friction,), those in by_condition([r for r in rows if r["passed"] is not None], ("friction",)).items():
-        of_level = by_condition(those, ("level",))
-        shares = [float(values(of_level[level], "passed").mean()) for level in sorted(of_level)]
-        found[float(friction)] = highest_level(shares, share)
-    return found
+    """Return the highest level passed by friction, of one ground's rows; nothing of flat ground."""
+    groups = {float(k[0]): _passes(those) for k, those in by_condition(rows, ("friction",)).items()}
+    return {k: highest_level(passed.mean(0).tolist(), share) for k, passed in groups.items() if passed.size}
 
 
 def _level(rows: Sequence[Row], share: float) -> float:
@@ -357,10 +300,11 @@ def _level(rows: Sequence[Row], share: float) -> float:
 
 def _score(rows: Sequence[Row], share: float) -> float:
     """Return the score of one ground, mean over frictions; that of flat ground is its quality."""
-    levels = _levels(rows, share)
-    commands = by_condition([r for r in rows if r["passed"] is None], ("friction",))
-    worst = {float(friction): float(values(those, "quality_worst").mean()) for (friction,), those in commands.items()}
-    scores = [score(level, worst.get(friction, 0.0)) for friction, level in levels.items()] or list(worst.values())
+    levels, scores = _levels(rows, share), []
+    for (friction,), those in by_condition(rows, ("friction",)).items():
+        worst = values(those, "quality_worst")
+        known = float(np.nanmean(worst)) if np.isfinite(worst).any() else 0.0
+        scores.append(score(levels[float(friction)], known) if levels else known)
     return float(np.mean(scores)) if scores else np.nan
 
 
@@ -386,13 +330,16 @@ def _draw_scores(summaries: Summaries) -> plots.Figure:
     return figure
 
 
-def _draw_levels(levels: Mapping[str, Mapping[float, int]]) -> plots.Figure:
-    figure, axes = plots.panels(1, height=2.4)
-    ax = axes[0, 0]
-    for k, (name, by_friction) in enumerate(levels.items()):
-        colour = plots.COLOURS[k % len(plots.COLOURS)]
-        ax.plot(list(by_friction), list(by_friction.values()), "o-", ms=3, color=colour, label=name.replace("_", " "))
-    ax.set(xlabel="friction of the feet", ylabel="highest level passed")
-    ax.set_ylim(bottom=-0.3)
-    plots.legend(figure, ax)
+def _draw_levels(of_grounds: Mapping[str, Sequence[Row]], share: float) -> plots.Figure:
+    figure, axes = plots.panels(1, 2, height=2.4)
+    left, right = axes[0]
+    for k, (name, rows) in enumerate(of_grounds.items()):
+        shares, levels = _passes(rows).mean(0), _levels(rows, share)
+        style = {"color": plots.COLOURS[k % len(plots.COLOURS)], "label": name.replace("_", " "), "ms": 3}
+        left.plot(range(1, len(shares) + 1), shares, "o-", **style)
+        right.plot(list(levels), list(levels.values()), "o-", **style)
+    left.set(xlabel="level", ylabel="share that passed", ylim=(-0.04, 1.04))
+    right.set(xlabel="friction of the feet", ylabel="highest level passed")
+    right.set_ylim(bottom=-0.3)
+    plots.legend(figure, left)
     return figure

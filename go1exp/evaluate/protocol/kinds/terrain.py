@@ -31,7 +31,7 @@ START_S = 1.0  # time that a robot has beside it, to begin, s
 @protocol("terrain")
 @settings
 class OnTerrain(Protocol):
-    """Success against difficulty on slopes, gravel, waves, stairs and boxes; where half and where 95 % succeed.
+    """Success against difficulty on slopes, gravel, waves, stairs, boxes, blocks; where half and where 95 % succeed.
 
     Attributes:
         grounds: difficulties of each ground, rising: degrees of slopes, metres of all others; null leaves one out.
