@@ -264,6 +264,15 @@ def test_each_robot_has_its_own_friction(stands: PolicyAgent) -> None:
     np.testing.assert_allclose(feet.numpy(), np.tile(friction[:, None], (1, 4)), rtol=1e-6)
 
 
+def test_the_figures_of_a_plan_take_the_memory_that_is_said(stands: PolicyAgent) -> None:
+    stage = Stage(stands, Setting(noise=False, randomize=False, trunk_velocity="exact", seed=1))
+    motion = stage.run(Plan(np.zeros((3, 2, 3)), figures=channels))
+    assert motion.figures is not None
+    assert motion.figures.shape == (3, 2, CHANNELS)
+    further = stage.bytes_per_second(2, None, CHANNELS)[0] - stage.bytes_per_second(2, None, 0)[0]
+    assert motion.figures.nbytes == pytest.approx(further * 3 * stage.policy_dt)
+
+
 # ---------------------------------------------------------------------- ground
 
 

@@ -132,7 +132,7 @@ def _refuse_too_long(chosen: Chosen, stage: Stage) -> None:
         return
     length = max(lengths, key=lambda one: _needed(one, stage))  # what mends the largest batch mends the others
     if (needed := _needed(length, stage)) > available:
-        plain, recorded = stage.bytes_per_second(length)
+        plain, recorded = stage.bytes_per_second(length.robots, length.policy_dt, length.figures)
         fitting = available / plain
         if length.recorded and length.settle_s < fitting:
             fitting = (available + length.settle_s * recorded) / (plain + recorded)
@@ -140,7 +140,7 @@ def _refuse_too_long(chosen: Chosen, stage: Stage) -> None:
 
 
 def _needed(length: Length, stage: Stage) -> float:
-    plain, recorded = stage.bytes_per_second(length)
+    plain, recorded = stage.bytes_per_second(length.robots, length.policy_dt, length.figures)
     listening = max(length.seconds - length.settle_s, 0.0) if length.recorded else 0.0
     return length.seconds * plain + listening * recorded
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,9 +26,6 @@ from go1exp.mdp.commands import FixedVelocity
 from go1exp.mdp.kinematics import KinematicState
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TaskConfig
-
-if TYPE_CHECKING:
-    from go1exp.evaluate.protocol.base import Length
 
 
 @dataclass(frozen=True)
@@ -76,11 +73,11 @@ class Stage:
         """Return the physics step with a policy of that period, s."""
         return self.setting.physics_dt or fitting_step(policy_dt, self.agent.task.sim.physics_dt)
 
-    def bytes_per_second(self, length: Length) -> tuple[float, float]:
-        """Return what robots take, B/s: always, and beside it while what measures need is recorded."""
-        dt = length.policy_dt or self.policy_dt
-        always, recorded = STEP_BYTES + 8 * length.figures, bytes_per_step(round(dt / self.physics_dt(dt)))
-        return length.robots * always / dt, length.robots * recorded / dt
+    def bytes_per_second(self, robots: int, policy_dt: float | None, figures: int) -> tuple[float, float]:
+        """Return what robots take, B/s: with ``figures`` numbers a step, and beside it while measures are recorded."""
+        dt = policy_dt or self.policy_dt
+        recorded = bytes_per_step(round(dt / self.physics_dt(dt)))
+        return robots * (STEP_BYTES + 8 * figures) / dt, robots * recorded / dt
 
     def expect(self, steps_of_robots: float) -> None:
         """Add to the expected number of policy steps times robots, for the progress."""

@@ -183,9 +183,9 @@ class RoboGauge(Protocol):
             followed = self._follow(stage, one, [levels[friction] for friction in self.frictions])
             rows += [row | followed.get(n, {}) for n, row in enumerate(walked)]
         rows += [self._who(FLAT, n) | row for n, row in self._follow(stage, None, [0] * len(self.frictions)).items()]
-        found = _overall(rows, _score, self.pass_share), _overall(rows, _level, self.pass_share)
+        mean_score, level = (_overall(rows, function, self.pass_share) for function in (_score, _level))
         others = ", ".join(f"{who} {value:g}" for who, value in PUBLISHED.items())
-        note = f"Score {found[0]:.3f}, mean level {found[1]:.1f}. Published for a Go2 in another simulation: {others}."
+        note = f"Score {mean_score:.3f}, mean level {level:.1f}. Published for a Go2 in another simulation: {others}."
         return Played(rows, {}, [note])
 
     def _walk(self, stage: Stage, name: str, one: Assessed) -> list[Row]:
