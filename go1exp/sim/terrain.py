@@ -279,7 +279,7 @@ def _unit_obstacles(config: TerrainConfig, along: FloatArray, flat_to: float, rn
 
 
 def blocks(
-    at: tuple[FloatArray, FloatArray],
+    at: tuple[NDArray[np.floating], NDArray[np.floating]],
     first: tuple[float, float],
     second: tuple[float, float],
     count: int,

@@ -63,7 +63,7 @@ def metrics(sampled: Array, command: Array, largest: Sequence[float]) -> Array:
     missed = sampled[..., :6] - wanted
     turns = np.diff(sampled[..., 9:], axis=0, prepend=sampled[:1, :, 9:])
     costs = (
-        np.linalg.norm(missed[..., :3], axis=-1) / np.hypot(*largest[:2]),
+        np.linalg.norm(missed[..., :3], axis=-1) / np.hypot(largest[0], largest[1]),
         np.linalg.norm(missed[..., 3:], axis=-1) / largest[2],
         sampled[..., 7],
         sampled[..., 8] / POWER,

@@ -82,7 +82,7 @@ def _boxes(x: Field, y: Field, difficulty: float, course: float, rng: np.random.
 def _obstacles(x: Field, y: Field, difficulty: float, course: float, rng: np.random.Generator) -> Field:
     across, along, middle = y[:, 0], x[0], 0.5 * float(y.max() + y.min())
     bounds, beside = (0.0, course), (float(y.min()), float(y.max()))
-    heights = blocks((across, along), beside, bounds, round(OBSTACLES * course * np.ptp(y)), rng)
+    heights = blocks((across, along), beside, bounds, round(OBSTACLES * course * float(np.ptp(y))), rng)
     centre = [np.abs(v - c) <= 0.5 * CENTRE_BLOCK for v, c in ((across, middle), (along, 0.5 * course))]
     heights[np.ix_(*centre)] = 1.0
     return difficulty * heights

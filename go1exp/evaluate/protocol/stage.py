@@ -265,7 +265,7 @@ def delay_of_effects(task: TaskConfig) -> float:
 def _with_friction(terms: tuple[Term, ...], bounds: tuple[float | Array, float | Array]) -> tuple[Term, ...]:
     """Return randomisations in which the feet's friction is drawn from ``bounds``, numbers or (N,)."""
     entry = members("rand")["foot_friction"]
-    each = tuple(torch.as_tensor(bound, dtype=torch.float32).unsqueeze(-1) for bound in bounds)
+    each = tuple(b if isinstance(b, float) else torch.from_numpy(b).float().unsqueeze(-1) for b in bounds)
     others = tuple(t for t in terms if t.entry.name != entry.name)
     return (*others, Term("foot_friction", entry, {"range": each, "operation": "set"}, {"when": "reset"}))
 
