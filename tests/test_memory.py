@@ -192,6 +192,8 @@ def test_a_step_takes_what_a_plan_and_its_motion_are_made_of(stage: Stage) -> No
         *((name, "seconds") for name in ("corners", "energy", "gait", "hardware", "sinusoid", "rate")),
         *(("kicks", key) for key in ("first_s", "every_s", "push_s")),
         *(("push_map", key) for key in ("settle_s", "watch_s", "push_s")),
+        *(("recover", key) for key in ("settle_s", "seconds")),
+        *(("robogauge", key) for key in ("move_s", "pair_s")),
         ("terrain", "slack"),
     ],
 )

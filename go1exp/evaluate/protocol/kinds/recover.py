@@ -156,7 +156,7 @@ class Recover(Protocol):
         """Return a row for each robot that lay on its side, then for each that lay on its back."""
         count, (kp, kd) = len(LYING) * self.robots, self.hold
         nothing = np.zeros((len(stage.times(self.settle_s)), count, 3))
-        start = np.stack([self._lying(stage, n) for n in range(count)])
+        start = np.stack([self.lying(stage, n) for n in range(count)])
         dropped: dict[str, Any] = {"start": start, "terminations": (), "figures": posture}
         drop = stage.session(Plan(nothing, **dropped, braking=Braking(0.0, kd, kp)))
         figures = drop.run(len(nothing)).figures
@@ -178,7 +178,7 @@ class Recover(Protocol):
         self.measure(motion, rows)
         return rows
 
-    def _lying(self, stage: Stage, n: int) -> Array:
+    def lying(self, stage: Stage, n: int) -> Array:
         """Return the state (19,) from which a robot is dropped; odd robots on the other side."""
         case, number = LYING[n // self.robots], n % self.robots
         rng = np.random.default_rng([stage.setting.seed, number])
