@@ -32,7 +32,13 @@ except ImportError as error:
     ) from error
 
 from go1exp.sim.physics.warp_constants import DERIVED, DerivedConstants
-from go1exp.sim.physics.warp_kernels import ContactReadings, units_kernel, use_mujocos_law, without_contact_sensors
+from go1exp.sim.physics.warp_kernels import (
+    ContactReadings,
+    compile_side_by_side,
+    units_kernel,
+    use_mujocos_law,
+    without_contact_sensors,
+)
 
 use_mujocos_law()  # of contacts with a height field, before any kernel is built
 
@@ -43,10 +49,6 @@ STATE_FIELDS = ("time", "qpos", "qvel", "qacc_warmstart", "ctrl")
 
 WARM_UP = 2
 """Runs of what is to be captured, before it is: they compile kernels and make what is made once."""
-
-MODULES = ("forward", "sensor", "smooth", "passive", "solver", "constraint", "support")
-"""Modules of mujoco-warp whose kernels every step calls. Compiled side by side before the first one; what is made for a
-model follows one by one, when it is called."""
 
 LOST = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "HFIELD", "CONTACT_MATCH")
 """Overflows by which contacts or constraints are lost (the others are limits of iterations)."""
@@ -99,8 +101,6 @@ class MujocoWarp:
         supported = copy.copy(model)
         supported.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # it has none to disable
         with self._scope():
-            kernels = [wp.get_module(f"{mjw.__name__}._src.{name}") for name in MODULES]
-            wp.force_load(self._wp_device, kernels, max_workers=len(kernels))
             self._model = mjw.put_model(supported)
             self._model.opt.warn_overflow = 0  # kernels that print are slow; see ``overflowed``
             without_contact_sensors(self._model)
@@ -109,6 +109,10 @@ class MujocoWarp:
             self._data = mjw.make_data(supported, nworld=num_envs, nconmax=nconmax, njmax=njmax)
             self._contacts = ContactReadings(supported, sensors, self._data.naconmax)
             self._constants = DerivedConstants(supported, num_envs)
+            nobody = wp.zeros(num_envs, dtype=wp.bool)
+            compile_side_by_side(
+                self._wp_device, lambda: (self._advance(), self._constants.update(self._model, nobody))
+            )
         d = self._data
         self.qpos, self.qvel, self._ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
         self.sensordata = wp.to_torch(d.sensordata)
@@ -143,8 +147,11 @@ class MujocoWarp:
         """Advance one physics step under joint torques (N, 12), N m."""
         self._ctrl.copy_(torque)
         with self._scope():
-            mjw.step(self._model, self._data)
-            self._contacts.update(self._model, self._data)
+            self._advance()
+
+    def _advance(self) -> None:
+        mjw.step(self._model, self._data)
+        self._contacts.update(self._model, self._data)
 
     def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         """Put the rows of ``mask`` into a state at rest in memory: no warm start, time 0, sensors current.

@@ -7,6 +7,11 @@ each contact knows its sensors. That is a fifth of a physics step. The readings 
 from __future__ import annotations
 
 import inspect
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from unittest import mock
 
 import mujoco
 import mujoco_warp as mjw
@@ -54,6 +59,35 @@ def _collect(
         wp.atomic_add(out, row, foot, 1.0)
         for axis in range(3):
             wp.atomic_add(out, row, foot + 1 + axis, sign * force[contact][axis])
+
+
+def compile_side_by_side(device: wp.Device, work: Callable[[], object]) -> None:
+    """Compile all kernels that ``work`` launches, each module in a thread of its own; nothing is launched.
+
+    Warp compiles a module when a kernel of it is launched, one after the other, and MuJoCo Warp makes thirty modules
+    for a model.
+    """
+    sizes: dict[wp.Module, set[int | None]] = {}
+
+    def note(
+        kernel: wp.Kernel, dim: int | Sequence[int], *_: object, block_dim: int | None = None, **__: object
+    ) -> None:
+        if np.prod(dim) > 0:  # of what a model does not have, there is nothing to launch
+            sizes.setdefault(kernel.module, set()).add(block_dim)
+
+    def once(_: object, while_body: Callable[..., None], **given: object) -> None:
+        while_body(**given)
+
+    def load(module: wp.Module) -> None:
+        for size in sizes[module]:
+            wp.force_load(device, [module], block_dim=size, max_workers=0)
+
+    with ExitStack() as stack:
+        for name, stand_in in (("launch", note), ("launch_tiled", note), ("capture_while", once)):
+            stack.enter_context(mock.patch.object(wp, name, stand_in))
+        work()
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        list(pool.map(load, sorted(sizes, key=lambda module: -len(module.kernels))))  # the longest first
 
 
 class ContactReadings:
