@@ -30,23 +30,22 @@ from tests.small_run import SMALL
 P, C = 6, 4
 """Columns of the policy and of the critic alone."""
 
-KINDS = ("decoder", "teacher")
 LEARNERS: tuple[type[AdaptivePPO], ...] = (AdaptivePPO, DevicePPO)
 
 
-def settings(kind: str, *overrides: str) -> TrainConfig:
-    given = ("critic=privileged", f"estimator={kind}", "estimator.latent=8", "estimator.hidden=[16]", *overrides)
+def settings(*overrides: str) -> TrainConfig:
+    given = ("critic=privileged", "estimator=decoder", "estimator.latent=8", "estimator.hidden=[16]", *overrides)
     return parse_train(compose("train", [*SMALL, "ppo.matmul_precision=highest", *given]))
 
 
 def learner(config: TrainConfig, kind: type[AdaptivePPO] = AdaptivePPO) -> Any:
-    core = Go1Core(trainer.trained_task(config), config.ppo.num_envs, 0, critic=True)
+    core = Go1Core(config.task, config.ppo.num_envs, 0, critic=True)
     return kind(config.ppo, Go1VecEnv(core), 0, "cpu", config.estimator)
 
 
-def network(kind: str) -> GaussianPolicy:
-    """Return a small policy that sees ``P`` of ``P + C`` columns; with a teacher the last one says who is a student."""
-    estimator = EstimatorConfig(kind, latent=8, hidden=(32,))  # type: ignore[arg-type]
+def network() -> GaussianPolicy:
+    """Return a small policy that sees ``P`` of ``P + C`` columns."""
+    estimator = EstimatorConfig(latent=8, hidden=(32,))
     config = parse_train(compose("train", ["ppo.hidden=[16]", "ppo.matmul_precision=highest"])).ppo
     columns, actions = (Box(-np.inf, np.inf, (size,), np.float32) for size in (P + C, 2))
     return GaussianPolicy(columns, actions, lambda _: 1e-3, **policy_settings(config, P, estimator, (C - 1, 1)))
@@ -67,7 +66,7 @@ def surrogate(policy: GaussianPolicy, rows: Tensor) -> Tensor:
 def test_a_decoder_finds_what_the_observation_says_of_the_critics_columns() -> None:
     """Columns that are a linear map of the observation, and one that is not in it: its mean is all that can be said."""
     torch.manual_seed(0)
-    policy, law = network("decoder"), torch.randn(P, C - 1)
+    policy, law = network(), torch.randn(P, C - 1)
     optimizer = torch.optim.Adam(policy.parameters(), lr=1e-2)
     for _ in range(400):
         seen, hidden = torch.randn(256, P), torch.randn(256, 1)
@@ -84,53 +83,17 @@ def test_a_decoder_finds_what_the_observation_says_of_the_critics_columns() -> N
     assert float(loss.detach()) == pytest.approx(float((error[:-1].mean() + error[-1]).detach() / 2), rel=0.2)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_ppos_gradient_stops_before_the_encoder(kind: str) -> None:
-    policy, rows = network(kind), torch.randn(5, P + C)
+def test_ppos_gradient_stops_before_the_encoder() -> None:
+    policy, rows = network(), torch.randn(5, P + C)
     assert gradients(policy, surrogate(policy, rows), "policy_net.net") > 0.0
     assert gradients(policy, surrogate(policy, rows), "encoder") == 0.0
     assert gradients(policy, policy.mlp_extractor.estimation_loss(rows), "encoder") > 0.0
 
 
-def test_a_teacher_learns_from_the_robots_that_act_on_it_and_a_student_from_all() -> None:
-    policy, rows = network("teacher"), torch.randn(6, P + C)
-    rows[:, -1] = 1.0
-    assert gradients(policy, surrogate(policy, rows), "teacher") == 0.0
-    alone = policy._predict(rows[:, :P], deterministic=True).detach()
-    torch.testing.assert_close(policy.evaluate_actions(rows, torch.ones(6, 2))[1], log_prob(policy, alone))
-    rows[:3, -1] = 0.0
-    assert gradients(policy, surrogate(policy, rows), "teacher") > 0.0
-    changed = policy.evaluate_actions(rows, torch.ones(6, 2))[1] - log_prob(policy, alone)
-    assert (changed[:3].abs() > 1e-4).all()
-    torch.testing.assert_close(changed[3:], torch.zeros(3), rtol=0.0, atol=1e-5)
-    assert gradients(policy, policy.mlp_extractor.estimation_loss(rows), "teacher") == 0.0
-
-
-def log_prob(policy: GaussianPolicy, mean: Tensor) -> Tensor:
-    """Return the log-probability of actions of 1 around ``mean``."""
-    return torch.distributions.Normal(mean, policy.log_std.exp()).log_prob(torch.ones_like(mean)).sum(-1)
-
-
-@pytest.mark.parametrize(("robots", "share"), [(400, 0.25), (4096, 0.5), (7, 1.0)])
-def test_students_are_a_share_of_the_robots_and_of_each_column_of_tiles(robots: int, share: float) -> None:
-    config = settings("teacher", f"estimator.students={share}")
-    terms = Go1Core(trainer.trained_task(config), robots, 0, critic=True).terms
-    student = terms.privileged[-1]
-    assert student.key == "student"
-    from go1exp.mdp.types import TermSetup
-
-    column = student(TermSetup(robots, torch.device("cpu"), 0.02))(None).squeeze(1)
-    assert float(column.mean()) == pytest.approx(share, abs=1.0 / robots + 0.003)
-    for tiles in (4, 10, 20) if robots > 100 else ():
-        each = column[: robots // tiles * tiles].view(-1, tiles).mean(0)
-        assert (each - share).abs().max() < 0.1
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_both_paths_collect_and_learn_the_same(kind: str) -> None:
+def test_both_paths_collect_and_learn_the_same() -> None:
     weights: list[dict[str, Tensor]] = []
     for path in LEARNERS:
-        ppo = learner(settings(kind, "ppo.symmetry=true", "ppo.minibatches=1"), path)
+        ppo = learner(settings("ppo.symmetry=true", "ppo.minibatches=1"), path)
         before = {name: value.clone() for name, value in ppo.policy.state_dict().items()}
         torch.manual_seed(1)  # one minibatch of all samples: no order that could differ
         logged: list[dict[str, float]] = []
@@ -143,12 +106,12 @@ def test_both_paths_collect_and_learn_the_same(kind: str) -> None:
         torch.testing.assert_close(weights[1][name], value, rtol=1e-3, atol=1e-5, msg=name)
 
 
-@pytest.fixture(scope="module", params=KINDS)
-def trained(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run folder of a policy with an estimator and a history, on mirrored samples."""
     run = tmp_path_factory.mktemp("estimator") / "run"
     given = (
-        f"estimator={request.param}",
+        "estimator=decoder",
         "observation=history",
         "critic=privileged",
         "ppo.symmetry=true",
@@ -167,7 +130,8 @@ def test_the_exported_graph_holds_the_estimator(trained: Path) -> None:
     targets, observation, action = (torch.from_numpy(out) for out in session.run(None, given))
     with torch.no_grad():
         wanted = policy._predict(observation, deterministic=True)
-        assert (policy.mlp_extractor.encoder(observation).std(0) > 0.0).all()
+        estimates = policy.mlp_extractor.estimate(observation)
+    assert (estimates.std(0) > 0.0).all()
     torch.testing.assert_close(action, wanted, rtol=1e-4, atol=1e-4)
     assert targets.shape == (3, 12)
 
@@ -185,11 +149,10 @@ def test_weights_fit_no_run_with_another_estimator(trained: Path) -> None:
     from go1exp.train.policy import read_weights
 
     other = parse_train(compose("train", [*SMALL, "observation=history", "critic=privileged", "ppo.symmetry=true"]))
-    with pytest.raises(ConfigError, match=r"estimator is .*'none'.* here and .* there"):
+    with pytest.raises(ConfigError, match=r"estimator is .*latent=0.* here and .*latent=32.* there"):
         read_weights(other, trained)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_an_estimator_needs_a_critic_that_sees_more(kind: str) -> None:
-    with pytest.raises(ConfigError, match=f"estimator.kind = '{kind}': .*critic=privileged"):
-        parse_train(compose("train", [*SMALL, f"estimator={kind}", "critic=none"]))
+def test_an_estimator_needs_a_critic_that_sees_more() -> None:
+    with pytest.raises(ConfigError, match=r"estimator: .*critic=privileged"):
+        parse_train(compose("train", [*SMALL, "estimator=decoder", "critic=none"]))

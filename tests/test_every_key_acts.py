@@ -129,6 +129,7 @@ NEEDS = {
     "reward/paper": ["schedule=none"],  # which sets three of its weights
     "curriculum/terrain_level": ["terrain=rough"],
     "critic/terrain": ["terrain=rough"],
+    **{f"estimator/{name}": ["critic=privileged"] for name in ("none", "decoder")},
     "experiment/clock": [  # it changes what these say
         *("observation=clock", "reward=clock", "ppo=warp", "command=widening", "actuator=delay"),
         "observation.gait_clock.rate=3.1",  # neither the file's nor the experiment's, which the rewards take over

@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from go1exp.base.tensors.memory import Memory
-from go1exp.config.schema.registry import Fraction, NonNegative, Positive, observation
+from go1exp.config.schema.registry import NonNegative, Positive, observation
 from go1exp.mdp.derived import clock_angle, joint_deviation
 from go1exp.mdp.ground import SCAN_COLUMNS, SCAN_ROWS
-from go1exp.mdp.mirror import ACTION, AXIAL, CLOCK, COMMAND, JOINTS, LEGS, POLAR, grid, unchanged
-from go1exp.mdp.types import Snapshot, TermSetup
+from go1exp.mdp.mirror import ACTION, AXIAL, CLOCK, COMMAND, JOINTS, LEGS, POLAR, grid
+from go1exp.mdp.types import Snapshot
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -114,28 +113,3 @@ def height_scan(s: Snapshot, *, scale: Positive = 1.0, offset: NonNegative = 0.3
     """
     assert s.height_scan is not None
     return ((s.height_scan + offset) * scale).clamp(-bound, bound)
-
-
-@observation("student", size=1, mirror=unchanged(1))
-class Student(Memory):
-    """1 for a ``share`` of the robots, always the same ones, spread evenly over them; 0 for the others.
-
-    ``estimator=teacher`` adds it to what the critic sees.
-    """
-
-    memory = ()
-
-    def __init__(self, setup: TermSetup, *, share: Fraction = 0.25) -> None:
-        golden = 0.5 * (5.0**0.5 - 1.0)  # its multiples, modulo 1, are even over robots and not aligned with tiles
-        place = torch.arange(setup.num_envs, dtype=torch.float64, device=setup.device) * golden % 1.0
-        self._column = (place < share).float().unsqueeze(1)
-
-    def advance(self, s: Snapshot) -> None:
-        """Nothing changes with time."""
-
-    def reset(self, mask: Tensor) -> None:
-        """Nothing begins anew with an episode."""
-
-    def __call__(self, s: Snapshot) -> Tensor:
-        """Return the column, (N, 1)."""
-        return self._column

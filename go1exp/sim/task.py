@@ -210,10 +210,7 @@ SECTIONS: dict[str, type] = {
     "ppo": PPOConfig,
     "logger": LoggerConfig,
     "checkpoint": CheckpointConfig,
-    "eval": EvalDuring,
-    "video": VideoDuring,
-    "stop": StopRule,
-    "estimator": EstimatorConfig,
+    **{name: type(default) for name, default in BESIDE.items()},
 }
 """Sections of the configuration that are one dataclass each (of the backend, one for each engine)."""
 
@@ -351,8 +348,8 @@ def _cross_rules(parts: Mapping[str, Any]) -> list[str]:
     if ppo and ppo.symmetry:
         for group in ("observation", "critic"):
             problems += mirror.problems(group, parts.get(group) or ())
-    if (estimator := parts.get("estimator")) and estimator.kind != "none" and not parts.get("critic"):
-        problems.append(f"estimator.kind = {estimator.kind!r}: learns from what the critic sees; use critic=privileged")
+    if (estimator := parts.get("estimator")) and estimator.latent and not parts.get("critic"):
+        problems.append("estimator: learns what the critic alone sees; use critic=privileged, or estimator=none")
     if "observation" in parts and not parts["observation"]:
         problems.append("observation: at least one term is required")
     terrain: Any = parts.get("terrain")

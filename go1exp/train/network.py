@@ -1,15 +1,9 @@
 """The networks that are trained: actor, critic, and an estimator that the actor reads.
 
 An estimator is a part of the actor. Its encoder makes a latent of the policy's own observation, which should have a
-history, and the actor reads the latent beside the observation. No gradient of PPO's loss reaches the encoder; what it
-learns is chosen by ``estimator.kind``:
-
-- ``decoder``: a linear readout of the latent must give what the critic alone sees (velocity, forces and heights of the
-  feet, the ground), as the estimators of DreamWaQ (Nahrendra et al., arXiv 2301.10602) and of Ji et al. (arXiv
-  2202.05481) do; here each term counts the same.
-- ``teacher``: the latent must be that of a teacher, an encoder of all that the critic sees, which PPO trains through
-  the robots that act on it; the others act on the encoder's latent. Concurrent teacher and student (Wang et al., arXiv
-  2405.10830).
+history; the actor reads the latent beside the observation. No gradient of PPO's loss reaches the encoder: it learns a
+latent of which a linear readout, the decoder, gives what the critic alone sees, such as velocity, heights of the feet
+and the ground around. After DreamWaQ (Nahrendra et al., arXiv 2301.10602) and Ji et al. (arXiv 2202.05481).
 """
 
 from __future__ import annotations
@@ -23,7 +17,6 @@ from stable_baselines3.common.distributions import DiagGaussianDistribution, Dis
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import MlpExtractor, create_mlp
 from torch import Tensor, nn
-from torch.nn.functional import mse_loss, normalize
 
 from go1exp.config.schema.training import EstimatorConfig
 from go1exp.sim.task import PPOConfig
@@ -59,19 +52,6 @@ def policy_settings(
     }
 
 
-class Latent(nn.Sequential):
-    """An encoder: rows (N, K) in, latents (N, L) out; where a teacher makes the same, on the unit sphere."""
-
-    def __init__(self, size: int, config: EstimatorConfig, activation: type[nn.Module]) -> None:
-        super().__init__(*create_mlp(size, config.latent, list(config.hidden), activation))
-        self._unit = config.kind == "teacher"
-
-    def forward(self, rows: Tensor) -> Tensor:
-        """Return the latents of ``rows``."""
-        latent = super().forward(rows)
-        return normalize(latent, dim=-1) if self._unit else latent
-
-
 class EstimatingActor(nn.Module):
     """An actor that reads its observation and the latent that its encoder makes of it.
 
@@ -80,14 +60,13 @@ class EstimatingActor(nn.Module):
         encoder: from observation (N, P) to latent (N, L).
     """
 
-    def __init__(self, net: nn.Module, encoder: Latent) -> None:
+    def __init__(self, net: nn.Module, encoder: nn.Module) -> None:
         super().__init__()
         self.net, self.encoder = net, encoder
 
-    def forward(self, observation: Tensor, latent: Tensor | None = None) -> Tensor:
-        """Return SB3's latent of the actor; ``latent`` (N, L) stands in for the encoder's."""
-        seen = self.encoder(observation).detach() if latent is None else latent
-        return self.net(torch.cat([observation, seen], dim=-1))
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return SB3's latent of the actor."""
+        return self.net(torch.cat([observation, self.encoder(observation).detach()], dim=-1))
 
 
 class TwoNetworks(MlpExtractor):
@@ -97,12 +76,11 @@ class TwoNetworks(MlpExtractor):
         policy_size: the first columns that are the actor's; None for all of them.
         bf16: multiply matrices in bfloat16 while training; weights and everything else stay float32.
         estimator: of the actor.
-        critic_widths: of the terms that the critic alone sees, which a decoder learns; one by default.
+        critic_widths: of the terms that the critic alone sees; one by default.
     """
 
     policy_net: nn.Module  # type: ignore[assignment]  # SB3's is always a Sequential
     decoder: nn.Linear
-    teacher: Latent
     _shares: Tensor
 
     def __init__(
@@ -118,62 +96,44 @@ class TwoNetworks(MlpExtractor):
         critic_widths: Sequence[int] = (),
     ) -> None:
         super().__init__(size, arch, activation, device)
-        self._policy_size, self._bf16, self._kind = policy_size, bf16, estimator.kind
+        self._policy_size, self._bf16, self._estimates = policy_size, bf16, estimator.latent > 0
         if policy_size is None:
             return
-        latent = estimator.latent if estimator.kind != "none" else 0
-        net = MlpExtractor(policy_size + latent, arch, activation, device).policy_net
-        self.policy_net = EstimatingActor(net, Latent(policy_size, estimator, activation)) if latent else net
-        if estimator.kind == "decoder":
-            widths = list(critic_widths) or [size - policy_size]
-            shares = [torch.full((width,), 1.0 / (width * len(widths))) for width in widths]
-            self.register_buffer("_shares", torch.cat(shares), persistent=False)
-            self.decoder = nn.Linear(latent, size - policy_size)
-        if estimator.kind == "teacher":
-            self.teacher = Latent(size, estimator, activation)
+        net = MlpExtractor(policy_size + estimator.latent, arch, activation, device).policy_net
+        self.policy_net = net
+        if not self._estimates:
+            return
+        encoder = nn.Sequential(*create_mlp(policy_size, estimator.latent, list(estimator.hidden), activation))
+        self.policy_net = EstimatingActor(net, encoder)
+        self.decoder = nn.Linear(estimator.latent, size - policy_size)
+        widths = critic_widths or [size - policy_size]
+        shares = [torch.full((width,), 1.0 / (width * len(widths))) for width in widths]
+        self.register_buffer("_shares", torch.cat(shares), persistent=False)
         self.to(device)
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Return the latents of actor and critic, float32."""
         if not self._bf16:
-            return self._actor_of_all(features), self.forward_critic(features)
+            return super().forward(features)
         with torch.autocast(features.device.type, torch.bfloat16, enabled=self.training):
-            pi, vf = self._actor_of_all(features), self.forward_critic(features)
+            pi, vf = super().forward(features)
         return pi.float(), vf.float()
 
     def forward_actor(self, features: Tensor) -> Tensor:
         """Return the actor's latent; columns of the critic may be missing."""
         return self.policy_net(features[..., : self._policy_size])
 
-    @property
-    def encoder(self) -> Latent:
-        """The estimator's, of the policy's observation."""
-        assert isinstance(self.policy_net, EstimatingActor)
-        return self.policy_net.encoder
-
-    def _actor_of_all(self, features: Tensor) -> Tensor:
-        """Return the actor's latent for rows with the critic's columns, of which the last one says who is a student."""
-        if self._kind != "teacher":
-            return self.forward_actor(features)
-        observation = features[..., : self._policy_size]
-        student = self.encoder(observation).detach()
-        latent = torch.where(features[..., -1:] > 0.5, student, self.teacher(features))
-        return self.policy_net(observation, latent)
-
     def estimate(self, observation: Tensor) -> Tensor:
-        """Return what a decoder takes the critic's own columns for, (N, C), from observations (N, P or more)."""
-        return self.decoder(self.encoder(observation[..., : self._policy_size]))
+        """Return what the estimator takes the critic's own columns for, (N, C), from observations (N, P or more)."""
+        assert isinstance(self.policy_net, EstimatingActor)
+        return self.decoder(self.policy_net.encoder(observation[..., : self._policy_size]))
 
     def estimation_loss(self, features: Tensor) -> Tensor:
-        """Return the mean square error of the estimator over rows of all columns, (); 0 without one."""
-        if self._kind == "decoder":
-            error = self.estimate(features) - features[..., self._policy_size :]
-            return (error.square() @ self._shares).mean()
-        if self._kind == "teacher":
-            with torch.no_grad():
-                taught = self.teacher(features)
-            return mse_loss(self.encoder(features[..., : self._policy_size]), taught)
-        return torch.zeros((), device=features.device)
+        """Return the mean square error of the estimate, (), in which each term counts the same; 0 without estimator."""
+        if not self._estimates:
+            return torch.zeros((), device=features.device)
+        error = self.estimate(features) - features[..., self._policy_size :]
+        return (error.square() @ self._shares).mean()
 
 
 class GaussianPolicy(ActorCriticPolicy):

@@ -145,7 +145,7 @@ def load_network(run: Path, config: TrainConfig, which: Path | None = None) -> t
         FileNotFoundError: if there is no checkpoint.
     """
     state, path = (checkpoint.read(which), which) if which else checkpoint.load_latest(run)
-    actor = "policy_net" if config.estimator.kind == "none" else "policy_net.encoder"
+    actor = "policy_net.encoder" if config.estimator.latent else "policy_net"
     size, policy_size = (state["policy"][f"mlp_extractor.{net}.0.weight"].shape[1] for net in ("value_net", actor))
     network = GaussianPolicy(
         Box(-np.inf, np.inf, (size,), np.float32),

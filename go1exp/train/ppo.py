@@ -260,7 +260,7 @@ class AdaptivePPO(PPO):
         means["clip_range"] = self.config.clip_range
         if self.config.value_clip is not None:
             means["clip_range_vf"] = self.config.value_clip
-        if self.policy.estimator.kind == "none":
+        if not self.policy.estimator.latent:
             del means["estimator_loss"]
         for name, value in means.items():
             self.logger.record(f"train/{name}", value)

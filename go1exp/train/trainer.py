@@ -20,13 +20,13 @@ from stable_baselines3.common.logger import Logger
 from go1exp.base import signals
 from go1exp.base.files import opened, write_json
 from go1exp.config.schema.physics import fitting_step
-from go1exp.config.schema.registry import Expected, bind
+from go1exp.config.schema.registry import Expected
 from go1exp.sim.effects.rules import nested_actuators
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.engine import device_of
 from go1exp.sim.env.faults import NumericalFault
 from go1exp.sim.env.sb3_env import Go1VecEnv
-from go1exp.sim.task import ObservationSlots, TaskConfig, TrainConfig, parse_train
+from go1exp.sim.task import TaskConfig, TrainConfig, parse_train
 from go1exp.train import checkpoint, metrics, preflight, run_folder
 from go1exp.train.asynchronous import AsyncEvaluation
 from go1exp.train.device import DevicePPO
@@ -137,17 +137,8 @@ class Stopped(Expected):
 
 
 def trained_task(config: TrainConfig) -> TaskConfig:
-    """Return the task as it is trained: with its own physics step, and with a column that tells teachers from students.
-
-    A net with a history of its own spacing keeps its step.
-    """
+    """Return the task with the physics step of the training; a net with a history of its own spacing keeps its step."""
     factor, task = config.ppo.coarse_physics, config.task
-    if config.estimator.kind == "teacher":
-        student, _ = bind(
-            "observation", "student", {"share": config.estimator.students}, "critic.student", ObservationSlots
-        )
-        assert student
-        task = replace(task, critic=(*task.critic, student))
     if factor == 1 or any(term.parameters.get("period") == "exact" for term, _ in nested_actuators(task.actuator)):
         return task
     step = fitting_step(task.sim.policy_dt, factor * task.sim.physics_dt)

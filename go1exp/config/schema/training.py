@@ -209,18 +209,14 @@ class EstimatorConfig(Strict):
     """What the actor reads beside its observation: a latent that an encoder makes of it (``train/network.py``).
 
     Attributes:
-        kind: ``decoder`` learns to tell what the critic alone sees, ``teacher`` what a teacher makes of it.
-        latent: numbers of the latent.
+        latent: numbers of the latent; 0 for no estimator.
         hidden: layers of the encoder.
         weight: of the estimator's loss beside PPO's.
-        students: share of the robots that act on the encoder's latent and not on the teacher's (Wang et al.: 0.25).
     """
 
-    kind: Literal["none", "decoder", "teacher"] = "none"
-    latent: Count = 32
+    latent: CountOrZero = 0
     hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (256, 128)
     weight: Positive = 1.0
-    students: Fraction = 0.25
 
 
 BESIDE: dict[str, Any] = {

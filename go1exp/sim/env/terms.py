@@ -218,15 +218,14 @@ class StepTerms:
         # Seen with MuJoCo Warp alone; an engine that evaluates a policy must not hide a fall behind it.
         self.distrusts = isinstance(task.backend, WarpBackend)
         self.left_map, self.impossible = torch.zeros(2, num_envs, dtype=torch.bool, device=device).unbind(0)
-        privileged = task.critic if critic else ()
+        self.privileged = task.critic if critic else ()
         self._observation_calls = calls("observation", task.observation)
-        self._critic_calls = calls("critic", privileged)
+        self._critic_calls = calls("critic", self.privileged)
         self._advancing, self._critic_advancing = (
             [part for key, part in self._remembering.items() if key.startswith(f"{group}.")]
             for group in ("observation", "critic")
         )
-        self.privileged = privileged
-        self.observed = (*task.observation, *privileged)
+        self.observed = (*task.observation, *self.privileged)
         self.read = {name for t in self.observed for name in t.entry.traits.get("reads", ())}
         widths = [width(t) for t in self.observed]
         self.observation_size, self.policy_size = sum(widths), sum(widths[: len(task.observation)])

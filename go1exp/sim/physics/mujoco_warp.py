@@ -34,7 +34,7 @@ except ImportError as error:
 from go1exp.sim.physics.warp_constants import DERIVED, DerivedConstants
 from go1exp.sim.physics.warp_kernels import (
     ContactReadings,
-    compile_side_by_side,
+    side_by_side,
     units_kernel,
     use_mujocos_law,
     without_contact_sensors,
@@ -110,9 +110,9 @@ class MujocoWarp:
             self._contacts = ContactReadings(supported, sensors, self._data.naconmax)
             self._constants = DerivedConstants(supported, num_envs)
             nobody = wp.zeros(num_envs, dtype=wp.bool)
-            compile_side_by_side(
-                self._wp_device, lambda: (self._advance(), self._constants.update(self._model, nobody))
-            )
+            with side_by_side(self._wp_device):
+                self._advance()
+                self._constants.update(self._model, nobody)
         d = self._data
         self.qpos, self.qvel, self._ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
         self.sensordata = wp.to_torch(d.sensordata)

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import contextmanager
 from unittest import mock
 
 import mujoco
@@ -61,8 +61,9 @@ def _collect(
             wp.atomic_add(out, row, foot + 1 + axis, sign * force[contact][axis])
 
 
-def compile_side_by_side(device: wp.Device, work: Callable[[], object]) -> None:
-    """Compile all kernels that ``work`` launches, each module in a thread of its own; nothing is launched.
+@contextmanager
+def side_by_side(device: wp.Device) -> Iterator[None]:
+    """Compile all kernels that the block launches, each module in a thread of its own; nothing is launched.
 
     Warp compiles a module when a kernel of it is launched, one after the other, and MuJoCo Warp makes thirty modules
     for a model.
@@ -82,10 +83,8 @@ def compile_side_by_side(device: wp.Device, work: Callable[[], object]) -> None:
         for size in sizes[module]:
             wp.force_load(device, [module], block_dim=size, max_workers=0)
 
-    with ExitStack() as stack:
-        for name, stand_in in (("launch", note), ("launch_tiled", note), ("capture_while", once)):
-            stack.enter_context(mock.patch.object(wp, name, stand_in))
-        work()
+    with mock.patch.multiple(wp, launch=note, launch_tiled=note, capture_while=once):
+        yield
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         list(pool.map(load, sorted(sizes, key=lambda module: -len(module.kernels))))  # the longest first
 
