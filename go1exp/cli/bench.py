@@ -71,6 +71,10 @@ GOALS = {
 }
 """Figures with a goal: its value and what it is. Lower limits, but where they say `at most`."""
 
+LIMIT = "_limit"
+"""End of the name of a figure that says what another one could be at best: with an update of matrix products alone, or
+with the memory of a robot's state alone; an environment is at best as fast as its engine."""
+
 
 def _task(container: dict[str, object]) -> None:
     settings = parse(BenchSettings, container)
@@ -110,9 +114,12 @@ def _task(container: dict[str, object]) -> None:
     about = " ".join(settings.overrides) or "defaults"
     print(f"suite={settings.suite} N={settings.num_envs} ({about})\n{env.machine()}\n")
     for name, value in figures.items():
+        if name.endswith(LIMIT):
+            continue
         goal, meaning = GOALS.get(name, (None, name.replace("_per_s", " per second").replace("_", " ")))
-        aim = "" if goal is None else f"goal {goal:g}"
-        print(f"{value:12,.2f}  {aim:10} {meaning}")
+        limit = figures.get(name + LIMIT, 1.0 if name.endswith("env_over_bare") else None)
+        aim, most = ("" if v is None else f"{k} {v:.3g}" for k, v in (("goal", goal), ("limit", limit)))
+        print(f"{value:12,.2f}  {aim:10} {most:11} {meaning}")
     if settings.out:
         out = Path(settings.out)
         out.parent.mkdir(parents=True, exist_ok=True)

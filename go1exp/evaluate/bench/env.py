@@ -27,12 +27,15 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from go1exp import robot
 from go1exp.config.schema.joint_values import spread
+from go1exp.sim.env.batch import MANY as MANY_ROBOTS
+from go1exp.sim.env.batch import robot_bytes
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.gym_env import Go1Env
 from go1exp.sim.physics.scene import build_model
 from go1exp.sim.task import TaskConfig, TrainConfig
 from go1exp.sim.terrain import build_terrain
 from go1exp.train import trainer
+from go1exp.train.network import policy_settings
 from go1exp.train.ppo import AdaptivePPO
 
 Subject = Callable[[], int]  # a piece of work to measure: does one unit and returns its number of environment steps
@@ -198,6 +201,7 @@ def run(task: TaskConfig, overrides: list[str], much: Measured) -> dict[str, flo
         "env_over_bare": ratio(measured, "env", "bare"),
         "env_over_subproc": ratio(measured, "env", "subproc"),
         "memory_per_env_kb": memory_per_env_kb(overrides),
+        "memory_per_env_kb_limit": robot_bytes(task, MANY_ROBOTS) / 1e3,
     }
 
 
@@ -213,9 +217,38 @@ def learning(ppo: AdaptivePPO, config: TrainConfig, finish: Callable[[], None] =
     return work
 
 
+def products_subject(ppo: AdaptivePPO, finish: Callable[[], None] = lambda: None) -> Subject:
+    """The matrix products of an update's linear layers alone, forward and backward: what an update takes at least.
+
+    The gradient of the observations is among them, which an update leaves out.
+    """
+    policy, c = ppo.policy, ppo.config
+    rows = ppo.batch_size * (2 if c.symmetry else 1)
+    kind = torch.bfloat16 if policy_settings(c)["bf16"] else torch.float32
+    weights = [m.weight.detach().to(kind) for m in policy.modules() if isinstance(m, torch.nn.Linear)]
+    layers = [(w, torch.randn(rows, w.shape[1]).to(w), torch.randn(rows, w.shape[0]).to(w)) for w in weights]
+
+    def work() -> int:
+        for _ in range(c.epochs * c.minibatches):
+            for weight, given, gradient in layers:
+                given @ weight.T, gradient.T @ given, gradient @ weight
+        finish()
+        return ppo.n_envs * ppo.n_steps
+
+    return work
+
+
+def least_time_share(measured: Mapping[str, list[float]]) -> float:
+    """Return what training over environment would be if an update took no longer than its matrix products."""
+    pairs = zip(measured["env"], measured["matrix_products"], strict=True)
+    return statistics.median(1.0 / (1.0 + env / products) for env, products in pairs)
+
+
 def train(config: TrainConfig, much: Measured) -> dict[str, float]:
     """Measure; return the figures by name."""
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, num_envs=much.num_envs))
-    subjects = {"train": learning(trainer.build(config), config), "env": core_subject(config.task, much.num_envs)}
-    measured = rates(subjects, much)
-    return {**speeds(measured), "train_over_env": ratio(measured, "train", "env")}
+    ppo = trainer.build(config)
+    subjects = {"train": learning(ppo, config), "env": core_subject(config.task, much.num_envs)}
+    measured = rates(subjects | {"matrix_products": products_subject(ppo)}, much)
+    over = {"train_over_env": ratio(measured, "train", "env"), "train_over_env_limit": least_time_share(measured)}
+    return {**speeds(measured), **over}

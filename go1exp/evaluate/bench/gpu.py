@@ -15,7 +15,17 @@ import torch
 from go1exp import robot
 from go1exp.config.schema.joint_values import spread
 from go1exp.config.schema.registry import ConfigError
-from go1exp.evaluate.bench.env import ACTION_SCALE, Measured, Subject, learning, rates, ratio, speeds
+from go1exp.evaluate.bench.env import (
+    ACTION_SCALE,
+    Measured,
+    Subject,
+    learning,
+    least_time_share,
+    products_subject,
+    rates,
+    ratio,
+    speeds,
+)
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.engine import make_backend
 from go1exp.sim.env.sb3_env import Go1VecEnv
@@ -124,8 +134,9 @@ def run(config: TrainConfig, overrides: list[str], much: Measured) -> dict[str, 
     core = Go1Core(config.task, much.num_envs)
     core.reset()
     subjects = {"bare": bare_subject(config.task, much.num_envs), "env": stepped(core.step, much.num_envs)}
-    training = learning(trainer.build(config), config, torch.cuda.synchronize)
-    subjects |= {"train": training, "numpy": border_subject(config)}
+    ppo = trainer.build(config)
+    subjects |= {"train": learning(ppo, config, torch.cuda.synchronize), "numpy": border_subject(config)}
+    subjects["matrix_products"] = products_subject(ppo, torch.cuda.synchronize)
     measured = rates(subjects, much)
     cold, warm = first_update_seconds([*overrides, f"ppo.num_envs={much.num_envs}"])
     speed = speeds(measured)
@@ -133,6 +144,7 @@ def run(config: TrainConfig, overrides: list[str], much: Measured) -> dict[str, 
         **speed,
         "gpu_env_over_bare": ratio(measured, "env", "bare"),
         "gpu_train_over_env": ratio(measured, "train", "env"),
+        "gpu_train_over_env_limit": least_time_share(measured),
         "gpu_train_over_numpy": ratio(measured, "train", "numpy"),
         "paper_minutes": PAPER_STEPS / speed["train_steps_per_s"] / 60.0,
         "first_update_cold_s": cold,
