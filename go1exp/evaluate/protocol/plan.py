@@ -256,7 +256,7 @@ class Brake:
     Attributes:
         since: (N,) time at which each robot began to brake, s; infinite before.
         torque_share: (N,) largest torque of a joint over its peak torque since then, or ever if none is to brake.
-        joint_speed: (N,) largest speed of a joint in that time, rad/s.
+        joint_speed: (N,) largest joint velocity in that time, rad/s.
         sink: (N,) largest downward speed of the trunk in that time, m/s.
     """
 

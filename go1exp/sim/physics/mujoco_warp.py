@@ -109,10 +109,10 @@ class MujocoWarp:
             self._data = mjw.make_data(supported, nworld=num_envs, nconmax=nconmax, njmax=njmax)
             self._contacts = ContactReadings(supported, sensors, self._data.naconmax)
             self._constants = DerivedConstants(supported, num_envs)
-            nobody = wp.zeros(num_envs, dtype=wp.bool)
+            none = wp.zeros(num_envs, dtype=wp.bool)
             with side_by_side(self._wp_device):
                 self._advance()
-                self._constants.update(self._model, nobody)
+                self._constants.update(self._model, none)
         d = self._data
         self.qpos, self.qvel, self._ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
         self.sensordata = wp.to_torch(d.sensordata)

@@ -51,7 +51,7 @@ class Rest:
 
     Attributes:
         speed: largest speed of the trunk, m/s, and largest angular velocity, rad/s.
-        joint_speed: largest speed of a joint, rad/s.
+        joint_speed: largest joint velocity, rad/s.
     """
 
     speed: Positive
@@ -127,7 +127,7 @@ class Recover(Protocol):
         Column("rest_s", "s", "time from the fall until at rest, of those", better="lower"),
         Column("sink", "m/s", "largest downward speed of the trunk after the fall", better="lower"),
         Column("torque_share", "", "largest torque of a joint over its peak torque", better="lower"),
-        Column("joint_speed", "rad/s", "largest speed of a joint", better="lower"),
+        Column("joint_speed", "rad/s", "largest joint velocity", better="lower"),
     )
 
     @property
@@ -235,7 +235,7 @@ class Recover(Protocol):
 
 
 def posture(s: Snapshot) -> Tensor:
-    """Return tilt, rad, larger speed of the trunk (m/s, rad/s), and largest speed of a joint, rad/s (N, 3)."""
+    """Return tilt, rad, larger speed of the trunk (m/s, rad/s), and largest joint velocity, rad/s (N, 3)."""
     tilt = torch.acos((-s.projected_gravity_b[:, 2]).clamp(-1.0, 1.0))
     speed = torch.maximum(s.base_lin_vel_b.norm(dim=-1), s.base_ang_vel_b.norm(dim=-1))
     return torch.stack([tilt, speed, s.joint_vel.abs().amax(-1)], 1)
