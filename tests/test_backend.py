@@ -71,6 +71,16 @@ def start(model: mujoco.MjModel, qpos: torch.Tensor, qvel: torch.Tensor) -> mujo
     return data
 
 
+def test_steps_read_no_clock(scene: Callable[..., tuple[mujoco.MjModel, Sensors]]) -> None:
+    """MuJoCo's timers cost a tenth of a step, and nobody reads them."""
+    model, _ = scene()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 3)
+    assert data.timer[mujoco.mjtTimer.mjTIMER_STEP].number == 3
+    assert data.timer[mujoco.mjtTimer.mjTIMER_STEP].duration == 0.0
+
+
+
 @GROUNDS
 def test_a_batch_is_a_serial_loop_over_its_own_models_bit_for_bit(make_backend: Build, ground: tuple[str, ...]) -> None:
     n, steps = 3, 250

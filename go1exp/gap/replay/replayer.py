@@ -150,11 +150,11 @@ class Replayer:
         plant = self._plant(rows, dt, softly)
         index = torch.as_tensor(rows.window)
         targets, enabled = self._signals(dt)
-        targets, enabled = targets[:, index], enabled[:, index]
         past = round(PAST_S / dt)
-        self._begin(plant, rows, targets[:past], dt)
+        self._begin(plant, rows, targets[:past, index], dt)
+        targets, enabled = targets[past:], enabled[past:]
         always = bool(enabled.all())
-        steps = len(targets) - past
+        steps = len(targets)
         first = max(int(np.floor(w.t[:, 0].min() / dt)) - 1, 0)
         kept = steps - first
         shape = (kept, len(index), len(w.joints))
@@ -171,10 +171,10 @@ class Replayer:
                 if recorder is not None:
                     recorder.record(k - first, plant)
             if not always:
-                plant.enabled = enabled[past + k]
+                plant.enabled = enabled[k, index]
             if carry is not None:
                 carry(k)
-            plant.step(targets[past + k])
+            plant.step(targets[k, index])
             if torque is not None and k >= first:
                 torque[k - first] = plant.reported_torque().numpy()
         self.made += len(index) * steps
@@ -192,28 +192,22 @@ def hold(backend: PhysicsBackend, quats: np.ndarray) -> None:
 
 
 def padded(rows: int) -> int:
-    """Return how many simulations to make for ``rows``: at most a quarter, or 7, more, so that few sizes are built."""
-    step = min(max(8, 1 << max(rows.bit_length() - 3, 0)), 64)  # whole vectors of eight: same bits wherever a row is
-    return -(-rows // step) * step
+    """Return how many simulations to make for ``rows``: whole vectors of eight, for the same bits wherever a row is."""
+    return -(-rows // 8) * 8
 
 
 def _sampled(q: np.ndarray, qd: np.ndarray, torque: np.ndarray | None, at: np.ndarray, dt: float) -> np.ndarray:
     """Interpolate (K, R, J) to the times ``at`` (R, n), in steps: angles by cubics, the rest by lines."""
-    rows, joints = at.shape[0], q.shape[2]
-    low = np.clip(np.floor(at + 1e-6).astype(int), 0, len(q) - 2)
-    share = np.maximum(at - low, 0.0)[..., None]
-    before = low * rows + np.arange(rows)[:, None]
-
-    def values(signal: np.ndarray, place: np.ndarray) -> np.ndarray:
-        return np.take(signal.reshape(-1, joints), place, axis=0)
-
     signals = [q, qd] if torque is None else [q, qd, torque]
-    first = [values(signal, before) for signal in signals]
-    if share.max() < 1e-4:
-        return np.stack(first, axis=2)
-    second = [values(signal, before + rows) for signal in signals]
-    y = np.stack([a + share * (b - a) for a, b in zip(first, second, strict=True)], axis=2)
-    (a, va), (b, vb) = first[:2], second[:2]
-    s2, s3 = share**2, share**3
-    y[:, :, 0] = a + share * dt * va + s2 * (3 * (b - a) - dt * (2 * va + vb)) + s3 * (2 * (a - b) + dt * (va + vb))
+    y = np.empty((*at.shape, len(signals), q.shape[2]))
+    for rows in np.array_split(np.arange(len(at)), -(-len(at) // 16)):  # few enough to stay in the cache
+        low = np.clip(np.floor(at[rows] + 1e-6).astype(int), 0, len(q) - 2)
+        share = np.maximum(at[rows] - low, 0.0)[..., None]
+        first, second = ([signal[low + k, rows[:, None]] for signal in signals] for k in (0, 1))
+        for c, (before, after) in enumerate(zip(first, second, strict=True)):
+            y[rows, :, c] = before + share * (after - before)
+        (a, va), (b, vb) = first[:2], second[:2]
+        s2, s3 = share**2, share**3
+        y[rows, :, 0] = a + share * dt * va + s2 * (3 * (b - a) - dt * (2 * va + vb))
+        y[rows, :, 0] += s3 * (2 * (a - b) + dt * (va + vb))
     return y

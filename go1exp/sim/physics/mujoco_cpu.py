@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import warnings
 from collections.abc import Mapping
 from operator import attrgetter
@@ -26,6 +28,9 @@ DERIVED = "dof_M0"
 _log = mujoco.MjLogConfig.get()
 _log.logto_file = False  # MuJoCo would leave MUJOCO_LOG.TXT in the working folder
 _log.set()
+
+with contextlib.suppress(AttributeError, OSError, ValueError):  # the bindings time every step: a tenth of it
+    ctypes.c_void_p.in_dll(ctypes.CDLL(mujoco._callbacks.__file__), "mjcb_time").value = None
 
 
 class MujocoCpu:
