@@ -80,7 +80,6 @@ def test_steps_read_no_clock(scene: Callable[..., tuple[mujoco.MjModel, Sensors]
     assert data.timer[mujoco.mjtTimer.mjTIMER_STEP].duration == 0.0
 
 
-
 @GROUNDS
 def test_a_batch_is_a_serial_loop_over_its_own_models_bit_for_bit(make_backend: Build, ground: tuple[str, ...]) -> None:
     n, steps = 3, 250

@@ -133,14 +133,18 @@ def unknowns(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the values of unknowns (size,), and what counts as one of each: its tolerance, or else its range."""
     values, unit = np.empty(layout.size), np.empty(layout.size)
+    params = _params(columns, tolerances)
     for i in range(layout.size):
-        probe = columns[layout.probe[i]]
-        assert isinstance(probe.key, tuple)
-        p = tolerances.param(probe.key)
+        probe, p = columns[layout.probe[i]], params[layout.probe[i]]
         by_joint = np.ravel(theta.get(probe.key, np.array([p.null])))
         values[i] = by_joint[_joint(layout, probe, i) if by_joint.size > 1 else 0]
         unit[i] = p.tolerance if math.isfinite(p.tolerance) else p.high - p.low
     return values, unit
+
+
+def _params(columns: Sequence[Probe], tolerances: Tolerances) -> list[Param]:
+    """Return the declaration of each probe's parameter."""
+    return [tolerances.param(probe.key) for probe in columns if isinstance(probe.key, tuple)]  # all of them
 
 
 def _joint(layout: Layout, probe: Probe, i: int) -> int:
@@ -164,10 +168,11 @@ def bounds(
     """
     low, high, centre, weight = (np.zeros(layout.size) for _ in range(4))
     values, unit = unknowns(layout, columns, theta, may.tolerances)
+    params = _params(columns, may.tolerances)
     for i, value in enumerate(values):
-        probe = columns[layout.probe[i]]
+        probe, p = columns[layout.probe[i]], params[layout.probe[i]]
         assert isinstance(probe.key, tuple)
-        p, j = may.tolerances.param(probe.key), _joint(layout, probe, i)
+        j = _joint(layout, probe, i)
         reach = may.reach(probe.key, int(layout.joint[i]))
         wide = not math.isfinite(reach)
         low[i] = max(p.low, p.null - reach) - value

@@ -87,13 +87,16 @@ def _rounded(log: Log, name: str, other: str, a: np.ndarray, b: np.ndarray) -> I
     Rows count in which the angle moves by many times the rounding: an actuator would have to follow its target within
     a tenth of a row to pass for a copy, or to be ahead of it.
     """
-    close = min(max(0.51 * signals.quantum(a), 1e-6 * float(np.ptp(b))), 2e-3 * float(np.ptp(b)))
+    close = min(max(0.51 * log.target_steps[name], 1e-6 * float(np.ptp(b))), 2e-3 * float(np.ptp(b)))
     for late in range(limits.LAW_ROWS):
         earlier = np.roll(b, late)
+        near = np.abs(a - earlier) <= close
+        if np.count_nonzero(near) <= limits.ROUNDED * limits.ENOUGH:
+            continue  # most pairs: too few, wherever the angle moves fast
         fast = np.abs(np.roll(earlier, -1) - np.roll(earlier, 1)) > limits.FAST_STEPS * close
         fast[: late + 1] = fast[-1:] = False
         fast &= log.on
-        share = float(np.mean(np.abs(a - earlier)[fast] <= close)) if fast.sum() >= limits.ENOUGH else 0.0
+        share = float(np.mean(near[fast])) if fast.sum() >= limits.ENOUGH else 0.0
         if share > limits.ROUNDED:
             rows = f" of {late} rows before" if late else " of the same row"
             message = f"equals {other}{rows} up to rounding in {share:.1%} of the rows in which it moves fast"

@@ -268,6 +268,11 @@ class Log:
         return {c: quantum(self.recording.channels[c]) for c in self.measured}
 
     @cached_property
+    def target_steps(self) -> dict[str, float]:
+        """Quantisation step of each target of an angle, 0 if continuous."""
+        return {c: quantum(self.recording.channels[c]) for c, q in self.quantity.items() if q == "q_target"}
+
+    @cached_property
     def floors(self) -> dict[str, tuple[float, bool]]:
         """Noise floor of each measured column, and whether it looks like noise."""
         return {c: noise(self.recording.channels[c]) for c in self.measured}
