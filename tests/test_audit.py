@@ -286,6 +286,15 @@ def test_a_channel_that_is_read_at_another_rate_is_named() -> None:
     assert float(message.split()[-2]) == pytest.approx(100, rel=0.15)
 
 
+def test_the_step_of_each_column_is_measured_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each target is compared with each angle; a step for each pair would take a third of an audit."""
+    asked: list[int] = []
+    measure = signals.quantum
+    monkeypatch.setattr(signals, "quantum", lambda values: asked.append(len(values)) or measure(values))
+    audit(made("chirp"))
+    assert 0 < len(asked) <= len(made("chirp").channels)
+
+
 @pytest.mark.parametrize("step", [3.028e-5, 3.8147e-4, 1.534e-3, 0.01])
 def test_the_step_of_an_encoder_is_found(step: float) -> None:
     offset = 0.12345 * step

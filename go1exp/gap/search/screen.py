@@ -290,7 +290,7 @@ def _columns(scorer: Scorer, theta: Theta, windows: np.ndarray, probes: Sequence
         by_effect.setdefault(p.key[0], []).append(k)
     lots: list[list[int]] = []
     for members in by_effect.values():
-        if lots and len(lots[-1]) + len(members) <= 14:
+        if lots and len(lots[-1]) + len(members) <= 45:
             lots[-1] += members
         else:
             lots.append(list(members))
