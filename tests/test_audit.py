@@ -40,33 +40,38 @@ STOPS = JOINT_POS_LIMITS
 TORQUES = joint_channels("tau_est", JOINTS)
 
 
-def respond(
-    t: np.ndarray, motion: excitations.Motion, delay: float, limit: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Joint angles, speeds and torques (T, 12) by semi-implicit Euler steps of 1 ms."""
-    h = 1e-3
+MOTIONS = ("chirp", "multisine", "steps", "slow_ramps", "gait", "torque_off", "squat", "drop")
+
+
+@cache
+def responses(delay: float, rate: float, limit: float) -> dict[str, tuple[excitations.Motion, np.ndarray]]:
+    """Motions by name, with joint angles, speeds and torques (3, T, 12) by semi-implicit Euler steps of 1 ms."""
+    t, h = np.arange(round(SECONDS * rate)) / rate, 1e-3
+    members = registry.members("excitation")
+    motions = {m: members[m].target(t, NOMINAL_STANCE, soft_limits(0.9), np.random.default_rng(5)) for m in MOTIONS}
     per = round((t[1] - t[0]) / h)
     row = np.clip(np.searchsorted(t, np.arange(len(t) * per) * h - delay + 1e-9, side="right") - 1, 0, None)
-    q, qd = motion.start.copy(), np.zeros(12)
-    out = np.empty((3, len(t), 12))
+    q = np.stack([m.start for m in motions.values()])
+    qd = np.zeros_like(q)
+    target, on = (np.stack([getattr(m, k) for m in motions.values()], axis=1) for k in ("target", "torque_enable"))
+    most = limit * per_joint(EFFORT_LIMIT)
+    out = np.empty((3, len(t), *q.shape))
     for i in range(len(t) * per):
         beyond = q - np.clip(q, STOPS[:, 0], STOPS[:, 1])
         stop = np.where(beyond != 0, 500 * beyond + 5 * qd, 0.0)
-        tau = np.clip(20 * (motion.target[row[i]] - q) - 0.5 * qd, -limit, limit) * motion.torque_enable[row[i]]
+        tau = np.clip(20 * (target[row[i]] - q) - 0.5 * qd, -most, most) * on[row[i], :, None]
         if i % per == 0:
             out[:, i // per] = q, qd, tau
         qd = qd + h / 0.03 * (tau - stop - 0.8 * np.sin(q) - 0.1 * np.tanh(qd / 0.05) - 0.01 * qd)
         q = q + h * qd
-    return out[0], out[1], out[2]
+    return {name: (motion, out[:, :, k]) for k, (name, motion) in enumerate(motions.items())}
 
 
 @cache
 def made(name: str = "steps", delay: float = 0.0, rate: float = RATE, limit: float = 1.0) -> Recording:
     """A sound, noise-free recording; arrays are shared, so tests copy what they change."""
     t = np.arange(round(SECONDS * rate)) / rate
-    member = registry.members("excitation")[name].target
-    motion = member(t, NOMINAL_STANCE, soft_limits(0.9), np.random.default_rng(5))
-    q, qd, tau = respond(t, motion, delay, limit * per_joint(EFFORT_LIMIT))
+    motion, (q, qd, tau) = responses(delay, rate, limit)[name]
     joints = {"q": q, "qd": qd, "q_target": motion.target, "tau_est": tau}
     channels = {"t": t} | {c: v for k, x in joints.items() for c, v in zip(joint_channels(k, JOINTS), x.T, strict=True)}
     turn = Rotation.from_euler("ZYX", np.stack([a * np.sin(w * t + p) for a, w, p in ROCKING], axis=1))
@@ -140,7 +145,7 @@ def size(report: AuditReport, check: str, channel: str) -> float:
 # ---------------------------------------------------------------------- no false alarms
 
 
-@pytest.mark.parametrize("name", ["chirp", "multisine", "steps", "slow_ramps", "gait", "torque_off", "squat", "drop"])
+@pytest.mark.parametrize("name", MOTIONS)
 def test_clean_simulated_data_are_ok(name: str) -> None:
     report = audit(made(name))
     assert report.flaws == []
@@ -620,35 +625,39 @@ def test_where_the_delay_cannot_be_told_none_is_given() -> None:
 
 def shifted(*rows: int) -> list[Recording]:
     """Recordings whose commands were logged so many rows late, of two motions in turn."""
-    several = []
-    for k, late in enumerate(rows):
-        sound = made(("steps", "multisine")[k % 2])
-        moved = {c: np.roll(v, late) for c, v in sound.channels.items() if c.startswith("q_target")}
-        several.append(about(with_(sound, **moved), episode=f"e{k}"))
-    return several
+    return [about(late(("steps", "multisine")[k % 2], n), episode=f"e{k}") for k, n in enumerate(rows)]
 
 
-DROP = about(made("drop"), episode="e4")
-LATE = [about(made(name, 0.02), episode=name) for name in ("steps", "multisine", "drop")]
+def late(name: str, rows: int) -> Recording:
+    moved = {c: np.roll(v, rows) for c, v in made(name).channels.items() if c.startswith("q_target")}
+    return with_(made(name), **moved)
+
+
+@cache
+def report_of_late(name: str, rows: int) -> AuditReport:
+    return audit(late(name, rows))
 
 
 @pytest.mark.parametrize(
-    ("recordings", "named", "line"),
+    ("rows", "drop", "named", "line"),
     [
-        (shifted(0, 0, 0, 0), [], ""),
-        (LATE, [], ""),
-        ([DROP], [], ""),
-        ([], [], ""),
-        (shifted(0, 0, 10, 0), ["e2"], r"joints answer their commands after -2\d.* \(e2\), -?\d.* ms in the others: "),
-        ([*shifted(-20, 0, 15, -8), DROP], ["e0", "e1", "e2", "e3", "e4"], r".*\(e2\) to.* have clocks of their own$"),
-        (shifted(10, 10, 10), ["e0", "e1", "e2"], ""),
+        ((0, 0, 0, 0), False, [], ""),
+        ((-10, -10), True, [], ""),
+        ((), True, [], ""),
+        ((), False, [], ""),
+        ((0, 0, 10, 0), False, ["e2"], r"joints answer their commands after -2\d.* \(e2\), -?\d.* ms in the others: "),
+        ((-20, 0, 15, -8), True, ["e0", "e1", "e2", "e3", "e4"], r".*\(e2\) to.* have clocks of their own$"),
+        ((10, 10, 10), False, ["e0", "e1", "e2"], ""),
     ],
     ids=["one clock", "all late", "no delay", "nothing", "one of them apart", "each its own", "after the answer"],
 )
 def test_recordings_are_named_whose_commands_have_another_clock(
-    recordings: list[Recording], named: list[str], line: str
+    rows: tuple[int, ...], drop: bool, named: list[str], line: str
 ) -> None:
-    apart = clock_flaws([audit(r) for r in recordings])
+    """Of motions in turn whose commands were logged so many rows late, and of one that shows no delay."""
+    reports = [report_of_late(("steps", "multisine")[k % 2], n) for k, n in enumerate(rows)]
+    reports += [report_of_late("drop", 0)] * drop
+    apart = clock_flaws([replace(r, episode=f"e{k}") for k, r in enumerate(reports)])
     assert list(apart) == named
     assert all(re.match(line, text) for text in apart.values())
 

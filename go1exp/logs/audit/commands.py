@@ -77,25 +77,23 @@ def _controller_law(log: Log) -> np.ndarray:
     The reported torque is fitted by target, angle and speed, at the best delay: tau = a q_target - b q - c qd + d. A
     load changes none of the factors, and a and b have one sign.
     """
-    r, signs = log.recording, np.zeros(len(log.joints))
+    r, signs, best = log.recording, np.zeros(len(log.joints)), np.full(len(log.joints), limits.LAW)
     if not r.has("tau_est"):
         return signs
-    motion = np.stack([r.joint(name) for name in ("q", "qd") if r.has(name)], axis=2)
-    target, tau = r.joint("q_target"), r.joint("tau_est")
-    for j in range(len(signs)):
-        best = limits.LAW
-        if abs(signals.correlation(target[:, j], motion[:, j, 0])) > limits.ALIKE:
-            continue  # then their factors cannot be separated
-        for lag in range(0, log.samples(limits.TORQUE_LAG) + 1, log.samples(0.002)):
-            now = np.flatnonzero(log.on[lag:]) + lag
-            inputs = np.column_stack([target[now - lag, j], motion[now, j], np.ones(len(now))])
-            y = tau[now, j]
-            factors = np.linalg.lstsq(inputs, y, rcond=None)[0]
-            explained = 1.0 - np.var(y - inputs @ factors) / max(float(np.var(y)), 1e-12)
-            if explained > best and min(np.std(inputs[:, k] * factors[k]) for k in (0, 1)) > limits.LAW_PART * np.std(
-                y
-            ):
-                best, signs[j] = explained, -np.sign(factors[0] * factors[1])
+    names = [name for name in ("q_target", "q", "qd", "tau_est") if r.has(name)]
+    series = np.stack([r.joint(name).T for name in names], axis=1)  # (J, K, T)
+    alike = [abs(signals.correlation(*pair)) > limits.ALIKE for pair in series[:, :2]]  # their factors are one
+    for lag in range(0, log.samples(limits.TORQUE_LAG) + 1, log.samples(0.002)):
+        late = np.concatenate([series[:, :1, : len(log.t) - lag], series[:, 1:, lag:]], axis=1)[:, :, log.on[lag:]]
+        late -= late.mean(axis=2, keepdims=True)
+        about = late @ late.transpose(0, 2, 1) / late.shape[2]  # covariances (J, K, K)
+        torque = about[:, -1, -1]
+        factors = (np.linalg.pinv(about[:, :-1, :-1], hermitian=True) @ about[:, :-1, -1:])[:, :, 0]
+        explained = np.sum(factors * about[:, :-1, -1], axis=1) / np.maximum(torque, 1e-12)
+        parts = factors[:, :2] ** 2 * np.diagonal(about, axis1=1, axis2=2)[:, :2]
+        better = (explained > best) & (parts.min(axis=1) > limits.LAW_PART**2 * torque) & ~np.array(alike)
+        best = np.where(better, explained, best)
+        signs = np.where(better, -np.sign(factors[:, 0] * factors[:, 1]), signs)
     return signs
 
 
@@ -268,10 +266,10 @@ def _best(y: np.ndarray, base: np.ndarray, commands: np.ndarray, times: np.ndarr
     q = q[:, np.abs(np.diag(r)) > 1e-8]  # without columns that depend on earlier ones
     y = y - q @ (q.T @ y)
     commands = commands - q @ (q.T @ commands)
-    parts = np.array_split(np.arange(len(y)), BLOCKS)
-    yy = np.array([y[p] @ y[p] for p in parts])
-    uy = np.stack([y[p] @ commands[p] for p in parts])
-    uu = np.stack([np.einsum("nd,nd->d", commands[p], commands[p]) for p in parts])
+    blocks = list(zip(np.array_split(y, BLOCKS), np.array_split(commands, BLOCKS), strict=True))
+    yy = np.array([part @ part for part, _ in blocks])
+    uy = np.stack([part @ u for part, u in blocks])
+    uu = np.stack([np.einsum("nd,nd->d", u, u) for _, u in blocks])
 
     def minimum(keep: np.ndarray) -> tuple[float, float]:
         cross, power = keep @ uy, np.maximum(keep @ uu, 1e-12)

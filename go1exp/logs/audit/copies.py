@@ -69,7 +69,7 @@ def _equal(log: Log, name: str, other: str) -> Iterator[Finding]:
     rounding = 0.51 * max(log.steps.get(c, 0.0) for c in (name, other)) if related else 0.0
     close = min(max(rounding, 1e-6 * span), 2e-3 * span)
     for late in (0, 1, -1) if related else (0,):
-        share, count = _shared(a, np.roll(b, late) if late else b, log.on, close)
+        share, count = _shared(a, b, late, log.on, close)
         if share > limits.COPIED and count >= limits.ENOUGH * (1.0 if share < limits.DERIVED else 0.2):
             row = f" of the row {'before' if late > 0 else 'after'}" if late else ""
             why = MEANING.get(kinds, "one of the two holds another quantity")
@@ -87,7 +87,7 @@ def _rounded(log: Log, name: str, other: str, a: np.ndarray, b: np.ndarray) -> I
     Rows count in which the angle moves by many times the rounding: an actuator would have to follow its target within
     a tenth of a row to pass for a copy, or to be ahead of it.
     """
-    close = min(max(0.51 * log.target_steps[name], 1e-6 * float(np.ptp(b))), 2e-3 * float(np.ptp(b)))
+    close = min(max(0.51 * log.target_steps[name], 1e-6 * log.spans[other]), 2e-3 * log.spans[other])
     for late in range(limits.LAW_ROWS):
         earlier = np.roll(b, late)
         near = np.abs(a - earlier) <= close
@@ -105,12 +105,16 @@ def _rounded(log: Log, name: str, other: str, a: np.ndarray, b: np.ndarray) -> I
             return
 
 
-def _shared(a: np.ndarray, b: np.ndarray, on: np.ndarray, close: float) -> tuple[float, int]:
-    """Return the share, and the number, of the ``on`` rows (T,) where two columns change to values that are close."""
-    part = slice(1, -1, max(1, len(a) // limits.COPY_ROWS))
-    near = np.abs(a[part] - b[part]) <= close
+def _shared(a: np.ndarray, b: np.ndarray, late: int, on: np.ndarray, close: float) -> tuple[float, int]:
+    """Return the share, and the number, of the ``on`` rows (T,) where two columns change to values that are close.
+
+    ``b`` is taken ``late`` rows later, -1 to 1.
+    """
+    every = max(1, len(a) // limits.COPY_ROWS)
+    near = np.abs(a[1:-1:every] - b[1 - late : len(b) - 1 - late : every]) <= close
     if np.count_nonzero(near) < limits.COPIED / 2 * len(near):
         return 0.0, 0  # most pairs, by a part of their rows
+    b = np.roll(b, late)
     changes, other = (np.append(False, np.diff(x) != 0.0) & on for x in (a, b))
     count = int((changes & other & (np.abs(a - b) <= close)).sum())
     return count / max(1, int((changes | other).sum())), count
@@ -136,15 +140,20 @@ class _Source:
         return _Source(x, log.sensor_noise[channel], np.append(False, np.diff(x) != 0.0) & log.on)
 
     def repeated(self, y: np.ndarray, predictions: Iterable[Prediction], step: float = 0.0) -> float:
-        """Return the share of rows in which ``y`` (T,), of steps ``step``, is nearer to a prediction than noise."""
+        """Return the share of rows in which ``y`` (T,), of steps ``step``, is nearer to a prediction than noise.
+
+        A share that is too small for a finding, or of a smoother ``y``, which cannot hold the noise, is 0.
+        """
         shares = [0.0]
         for predicted, gain in predictions:
             whole, noise = np.isfinite(predicted), self.noise * gain
             known = self.rows & whole
             close = max(limits.SAME_NOISE * noise, 0.51 * step if step < noise else 0.0)
-            as_rough = _roughness(y[whole]) > 0.5 * _roughness(predicted[whole])  # otherwise the noise is not in y
-            if known.sum() >= limits.ENOUGH and np.ptp(y[known]) > 0.0 and as_rough:
-                shares.append(float(np.mean(np.abs(y[known] - predicted[known]) < close)))
+            if known.sum() < limits.ENOUGH or np.ptp(y[known]) == 0.0:
+                continue
+            share = float(np.mean(np.abs(y[known] - predicted[known]) < close))
+            if share > limits.DERIVED and _roughness(y[whole]) > 0.5 * _roughness(predicted[whole]):
+                shares.append(share)
         return max(shares)
 
 

@@ -138,7 +138,7 @@ def _wrong_speeds(t: np.ndarray, names: Sequence[str], qd: np.ndarray, slopes: n
         # An impact turns a joint within a sample, too, but the angles show half of it.
         off = np.abs(x - slope)
         least = 0.7 * _returned(x) + limits.SURE * 1.4826 * float(np.median(off))
-        spikes = (_spikes(t, x, limits.REVERSED) | _alone(t, x)) & (off > least)
+        spikes = _spikes(t, x, limits.REVERSED) & (off > least)
         yield name, spikes & ~zeros, SPIKES
 
 
@@ -150,7 +150,9 @@ def _wrong_readings(
         out = _returned(x)
         usual = x[out <= limits.UNUSUAL * float(np.quantile(out, 0.9))]  # many spikes widen the range of all rows
         far, farther = (np.abs(x - np.median(x)) / _span(y) for y in (x, usual))
-        spikes = ((farther > limits.SPANS) & (_spikes(t, x, 0.0) | _alone(t, x))) | ((far > 2.0) & _alone(t, x))
+        off = _off(t, x)
+        alone = _alone(x, off)
+        spikes = ((farther > limits.SPANS) & (_reversed(x, off, 0.0) | alone)) | ((far > 2.0) & alone)
         yield name, spikes & sound, SPIKES
 
 
@@ -183,7 +185,7 @@ def _outliers(t: np.ndarray, q: np.ndarray, sound: np.ndarray) -> np.ndarray:
     left, least = sound.copy(), limits.REVERSED * float(np.median(np.diff(t)))
     while left.sum() > limits.ENOUGH:
         x = q[left]
-        wrong = _spikes(t[left], x, least) | _alone(t[left], x)
+        wrong = _spikes(t[left], x, least)
         if not wrong.any():
             break
         left[np.flatnonzero(left)[wrong]] = False
@@ -191,14 +193,20 @@ def _outliers(t: np.ndarray, q: np.ndarray, sound: np.ndarray) -> np.ndarray:
 
 
 def _spikes(t: np.ndarray, x: np.ndarray, least: float) -> np.ndarray:
+    """Return samples (T,) bool that go out and back by more than ``least`` and the usual, or are off alone."""
+    off = _off(t, x)
+    return _reversed(x, off, least) | _alone(x, off)
+
+
+def _reversed(x: np.ndarray, off: np.ndarray, least: float) -> np.ndarray:
     """Return samples (T,) bool that go out and back by more than ``least`` and the usual, as no smooth motion does."""
     out = _returned(x)
-    return (out > max(least, limits.UNUSUAL * float(np.quantile(out, 0.9)))) & (_off(t, x) > 0.5 * out)
+    return (out > max(least, limits.UNUSUAL * float(np.quantile(out, 0.9)))) & (off > 0.5 * out)
 
 
-def _alone(t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return samples (T,) bool that are off alone: by more than usual, than their neighbours, and than at a bend."""
-    off, steps = _off(t, x), np.abs(np.diff(x))
+def _alone(x: np.ndarray, off: np.ndarray) -> np.ndarray:
+    """Return samples (T,) bool that are ``off`` alone: more than usual, than their neighbours, and than at a bend."""
+    steps = np.abs(np.diff(x))
     noise = max(float(np.quantile(off[off > 0.0], 0.9)) if off.any() else 0.0, _step(x) / np.sqrt(12.0))
     rows = (_returned(x) > 0.0) & (off > max(limits.UNUSUAL * noise, float(np.quantile(steps, 0.95))))
     rows[1:-1] &= off[1:-1] > 0.8 * np.maximum(steps[1:], steps[:-1])
