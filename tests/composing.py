@@ -1,0 +1,42 @@
+"""Hydra composes the same files hundreds of times in a test session; here they are merged once."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Sequence
+from typing import Any
+
+from hydra._internal import defaults_list
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra.core.config_store import ConfigStore
+
+from go1exp.config.hydra_adapter import VerbSource, _stamps
+
+OWN = frozenset(ConfigStore.instance().repo)
+"""Names of Hydra's own nodes; others come from a user's file, for one command."""
+
+merge, choices_of = ConfigLoaderImpl._compose_config_from_defaults_list, defaults_list._create_interpolation_map
+merged: dict[tuple[Any, ...], bytes] = {}
+
+
+def merged_once(self: ConfigLoaderImpl, defaults: Sequence[Any], repo: Any) -> Any:
+    """Return a copy of what Hydra merges of the same unchanged files; overrides of values come after it."""
+    if not OWN.issuperset(ConfigStore.instance().repo):
+        return merge(self, list(defaults), repo)
+    sources = tuple((source.scheme(), source.path) for source in repo.get_sources())
+    state = tuple(_stamps(path) for scheme, path in sources if scheme in ("file", VerbSource.scheme()))
+    key = (repr(defaults), sources, state)
+    if key not in merged:
+        merged[key] = pickle.dumps(merge(self, list(defaults), repo))
+    return pickle.loads(merged[key])
+
+
+def choices_where_needed(overrides: Any, listed: Sequence[Any], *rest: Any) -> Any:
+    """Return Hydra's map of choices for ``${...}`` in a defaults list; of a list without any, nobody reads it."""
+    return choices_of(overrides, list(listed), *rest) if any(d.is_interpolation() for d in listed) else None
+
+
+def install() -> None:
+    """Let this process compose so."""
+    ConfigLoaderImpl._compose_config_from_defaults_list = merged_once  # type: ignore[method-assign]
+    defaults_list._create_interpolation_map = choices_where_needed
