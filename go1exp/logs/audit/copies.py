@@ -185,11 +185,12 @@ def _fitted(y: np.ndarray, angles: np.ndarray, others: np.ndarray) -> Prediction
     inputs = np.column_stack([angles, others])
     use = np.flatnonzero(np.isfinite(inputs).all(axis=1))
     use = use[:: max(1, len(use) // limits.COPY_ROWS)]
-    best = use
+    known, wanted = inputs[use], y[use]
+    best = np.ones(len(use), dtype=bool)
     for _ in range(3):
-        factors = np.linalg.lstsq(inputs[best], y[best], rcond=None)[0]
-        off = np.abs(inputs[use] @ factors - y[use])
-        best = use[off <= np.quantile(off, limits.FITTED)]
+        factors = np.linalg.lstsq(known[best], wanted[best], rcond=None)[0]
+        off = np.abs(known @ factors - wanted)
+        best = off <= np.quantile(off, limits.FITTED)
     return inputs @ factors, float(np.linalg.norm(factors[: angles.shape[1]]))
 
 

@@ -119,7 +119,8 @@ def torque(log: Log) -> Iterator[Finding]:
         expected += [command[late] - state[most:]] + ([command[late] - state[late]] if lag else [])
     # expected[i] and tau have the same length: the first samples, without a command at the largest lag, are cut.
     tau, on = tau[most:], log.on[most:, None]
-    usable = [on & (np.abs(e) < highest) & (np.abs(tau) < highest) for e in expected]
+    on = on & (np.abs(tau) < highest)
+    usable = [on & (np.abs(e) < highest) for e in expected]
     match = np.array([_masked_correlation(e, tau, use) for e, use in zip(expected, usable, strict=True)])
     for j, joint in enumerate(log.joints):
         k = int(np.argmax(np.abs(match[:, j])))
@@ -134,9 +135,10 @@ def torque(log: Log) -> Iterator[Finding]:
 
 def _masked_correlation(a: np.ndarray, b: np.ndarray, use: np.ndarray) -> np.ndarray:
     """Return the correlation (J,), about zero, of the columns of ``a`` and ``b`` (T, J) where ``use`` is set."""
-    a, b = np.where(use, a, 0.0), np.where(use, b, 0.0)
-    spread = np.sqrt(np.sum(a * a, axis=0) * np.sum(b * b, axis=0))
-    return np.divide(np.sum(a * b, axis=0), spread, out=np.zeros(a.shape[1]), where=spread > 0)
+    a, b = a * use, b * use
+    aa, ab, bb = (np.einsum("tj,tj->j", *pair) for pair in ((a, a), (a, b), (b, b)))
+    spread = np.sqrt(aa * bb)
+    return np.divide(ab, spread, out=np.zeros(a.shape[1]), where=spread > 0)
 
 
 def rotation(log: Log) -> Iterator[Finding]:
