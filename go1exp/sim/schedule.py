@@ -18,10 +18,11 @@ import dataclasses
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from go1exp.config.schema.physics import ContactConfig
 from go1exp.config.schema.registry import Term, as_json, explain, unknown_name
+from go1exp.config.schema.settings import adapter
 from go1exp.config.schema.training import Ramp, Value
 from go1exp.mdp.commands import AXES
 
@@ -49,7 +50,7 @@ def parse(settings: object, parts: Mapping[str, Any]) -> tuple[dict[str, Ramp], 
         if given is None:  # taken away, as an ablation does
             continue
         try:
-            ramps[str(key)] = _with_end(TypeAdapter(Ramp).validate_json(as_json(given)), parts)
+            ramps[str(key)] = _with_end(adapter(Ramp).validate_json(as_json(given)), parts)
         except ValidationError as error:
             problems += explain(error, f"schedule.{key}", KEYS)
     setters: dict[str, str] = {}
@@ -144,7 +145,7 @@ def _value_problems(path: str, target: str, value: Value, parts: Mapping[str, An
     if target == CONTACT_TIME:
         settings = {"time_constant": value, "cone": "pyramidal", "impratio": 1.0}
         try:
-            TypeAdapter(ContactConfig).validate_json(as_json(settings))
+            adapter(ContactConfig).validate_json(as_json(settings))
         except ValidationError as error:
             return _renamed(explain(error, "", settings), "time_constant", path)
         return []

@@ -18,6 +18,7 @@ import platform
 import subprocess
 import warnings
 from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -132,11 +133,18 @@ def _meta(container: Mapping[str, object]) -> dict[str, object]:
         "git_dirty": bool(_git("status", "--porcelain", "--untracked-files=no")),
         "seed": container.get("seed"),
         "packages": {name: version(name) for name in PACKAGES},
-        "installed": {d.name: d.version for d in sorted(importlib.metadata.distributions(), key=lambda d: d.name)},
+        "installed": _installed(),
         "python": platform.python_version(),
         "machine": {"processor": _processor(), "cores": os.cpu_count(), **_gpus()},
         "assets_sha256": {str(p.relative_to(data_root())): hashlib.sha256(p.read_bytes()).hexdigest() for p in assets},
     }
+
+
+@cache
+def _installed() -> dict[str, str]:
+    """Return the version of each package that is installed, by name."""
+    found = [(d.name, d.version) for d in importlib.metadata.distributions()]
+    return dict(sorted(found, key=lambda pair: pair[0]))
 
 
 def _git(*arguments: str, folder: Path | None = None) -> str | None:

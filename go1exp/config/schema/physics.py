@@ -6,9 +6,10 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field, ValidationError
 
 from go1exp.config.schema.registry import Strict, as_json, one_of
+from go1exp.config.schema.settings import adapter
 
 Threads = Annotated[int, Field(ge=0, le=1024)]
 """Of the physics or of torch; 0 takes all cores."""
@@ -145,7 +146,7 @@ MUJOCO_CONTACT = ContactConfig(time_constant=0.02, cone="pyramidal", impratio=1.
 def read_contact(given: object) -> ContactConfig | None:
     """Return a contact from plain data; None if that is none."""
     try:
-        return TypeAdapter(ContactConfig).validate_json(as_json(given))
+        return adapter(ContactConfig).validate_json(as_json(given))
     except ValidationError:
         return None
 

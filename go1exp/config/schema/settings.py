@@ -10,6 +10,7 @@ import inspect
 import re
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
+from functools import cache
 from typing import Any, TypeVar, dataclass_transform, get_args, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
@@ -30,6 +31,12 @@ def settings(kind: type[T]) -> type[T]:
     return pydantic_dataclass(kind, frozen=True, kw_only=True, config=STRICT)  # type: ignore[return-value]
 
 
+@cache
+def adapter(kind: type[T]) -> TypeAdapter[T]:
+    """Return what checks data of ``kind``; to make one takes milliseconds."""
+    return TypeAdapter(kind)
+
+
 def parse(kind: type[T], container: Mapping[str, Any], examples: Mapping[str, str] | None = None, path: str = "") -> T:
     """Validate plain data as ``kind``.
 
@@ -48,7 +55,7 @@ def parse(kind: type[T], container: Mapping[str, Any], examples: Mapping[str, st
         hints = examples or {}
         raise ConfigError([f"{key}: required, such as {hints.get(key, f'{key}=...')}" for key in absent])
     try:
-        return TypeAdapter(kind).validate_json(as_json(container))
+        return adapter(kind).validate_json(as_json(container))
     except ValidationError as error:
         raise ConfigError(explain(error, path, [f.name for f in fields(kind)])) from None  # type: ignore[arg-type]
 

@@ -17,10 +17,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from go1exp.base.errors import Expected
 from go1exp.config.schema.registry import ConfigError, as_json, explain
+from go1exp.config.schema.settings import adapter
 from go1exp.deploy.runtime.bundle import CONFIG, MEMBERS, unpack
 from go1exp.deploy.sim_robot import SimConfig
 from go1exp.deploy.sim_robot.machine import Robot
@@ -60,7 +61,7 @@ def bundle_task(bundle: str, other: dict[str, Any]) -> TaskConfig:
 def sim_config(given: dict[str, Any]) -> SimConfig:
     """Check the settings of the simulated robot; raise ConfigError with every problem."""
     try:
-        return TypeAdapter(SimConfig).validate_json(as_json(given))
+        return adapter(SimConfig).validate_json(as_json(given))
     except ValidationError as error:
         raise ConfigError(explain(error, "sim", SimConfig.__dataclass_fields__)) from None
 

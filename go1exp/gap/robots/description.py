@@ -9,12 +9,13 @@ from dataclasses import dataclass, field, fields
 from typing import Annotated, ClassVar, Literal, TypeVar
 
 import numpy as np
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 
 import go1exp.sim.effects  # noqa: F401  (registers every effect)
 from go1exp.base.paths import data_root
 from go1exp.config.schema.joint_values import JointValues, each_within, spread
 from go1exp.config.schema.registry import STRICT, ConfigError, NonNegative, Positive, as_json, explain
+from go1exp.config.schema.settings import adapter
 from go1exp.sim.effects.tolerances import problems as tolerance_problems
 
 Name = Annotated[str, Field(min_length=1)]
@@ -190,6 +191,6 @@ Kind = TypeVar("Kind", ModelConfig, Go1Model)
 
 def _checked(kind: type[Kind], settings: Mapping[str, object], path: str) -> Kind:
     try:
-        return TypeAdapter(kind).validate_json(as_json(dict(settings)))
+        return adapter(kind).validate_json(as_json(dict(settings)))
     except ValidationError as error:
         raise ConfigError(explain(error, path, [f.name for f in fields(kind)])) from None
