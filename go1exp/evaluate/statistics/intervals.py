@@ -61,7 +61,7 @@ def mean_interval(values: ArrayLike) -> Interval:
     mean = float(each.mean())
     if len(each) < 2:
         return Interval(mean, np.nan, np.nan, 1)
-    half = float(scipy.stats.t.ppf(0.5 + 0.5 * LEVEL, len(each) - 1) * each.std(ddof=1) / np.sqrt(len(each)))
+    half = float(scipy.special.stdtrit(len(each) - 1, 0.5 + 0.5 * LEVEL) * each.std(ddof=1) / np.sqrt(len(each)))
     return Interval(mean, mean - half, mean + half, len(each))
 
 

@@ -27,8 +27,17 @@ Floats = NDArray[np.float64]
 
 
 def iqm(values: ArrayLike, axis: int | None = -1) -> Floats:
-    """Return the interquartile mean along an axis, or of all values (None), as rliable does: a trimmed mean."""
-    return np.asarray(scipy.stats.trim_mean(np.asarray(values, dtype=np.float64), TRIM, axis=axis))
+    """Return the interquartile mean along an axis, or of all values (None), as rliable does: a trimmed mean.
+
+    NaN where there is a NaN, or nothing; SciPy's ``trim_mean`` takes ten times as long for a few runs.
+    """
+    each = np.asarray(values, dtype=np.float64)
+    each = each.ravel() if axis is None else np.moveaxis(each, axis, -1)
+    if not each.shape[-1]:
+        return np.full(each.shape[:-1], np.nan)
+    cut = int(TRIM * each.shape[-1])
+    inner = np.sort(each, axis=-1)[..., cut : each.shape[-1] - cut].mean(axis=-1)
+    return np.asarray(np.where(np.isnan(each).any(axis=-1), np.nan, inner))
 
 
 def iqm_interval(values: ArrayLike) -> Interval:
