@@ -245,3 +245,19 @@ def test_a_fault_is_seen_and_not_healed(make_backend: Build, monkeypatch: pytest
     assert not torch.isfinite(backend.qvel[0]).all()
     assert torch.isfinite(backend.qpos[1]).all()
     assert torch.isfinite(backend.qvel[1]).all()
+
+
+@pytest.mark.parametrize("decoration", [False, True])
+def test_a_scene_leaves_the_next_one_as_it_was(make_task: Callable[..., TaskConfig], decoration: bool) -> None:
+    task = make_task()
+    ground = build_terrain(task.terrain)
+
+    def compiled(**how: Any) -> bytes:
+        model, _ = build_model(task.robot, ground, 0.002, decoration, **how)
+        content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+        mujoco.mj_saveModel(model, None, content)
+        return content.tobytes()
+
+    first = compiled()
+    assert compiled(held=(1.0, 0.0, 0.0, 0.0), mounted=True, imu=True) != first
+    assert compiled() == first

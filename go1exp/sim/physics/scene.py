@@ -6,6 +6,7 @@ Whatever the MDP needs beyond qpos and qvel is a sensor declared here.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import mujoco
 import numpy as np
@@ -143,6 +144,16 @@ def load_robot(inertia: str = "merged") -> mujoco.MjSpec:
     return spec
 
 
+@cache
+def _shaped(inertia: str, touches: bool, decoration: bool) -> mujoco.MjSpec:
+    """Return the robot with the shapes that a scene needs, to be copied: to delete the others takes the longest."""
+    spec = load_robot(inertia)
+    for geom in list(spec.geoms):
+        if not touches or (geom.group == DECORATION_GROUP and not decoration):
+            spec.delete(geom)
+    return spec
+
+
 def add_mount(trunk: mujoco.MjsBody) -> None:
     """Let a held trunk move: three slides and two hinges, none of which has a spring or a damper yet.
 
@@ -231,7 +242,7 @@ def build_model(
             state is its joints' alone.
         mounted: the held trunk has the joints of ``sim/physics/scene.py``, whose state stands before that of the legs.
     """
-    spec = load_robot(config.inertia)
+    spec = _shaped(config.inertia, terrain is not None, decoration).copy()
     if held is not None:
         spec.delete(spec.joint("root"))
         for key in list(spec.keys):  # their state has a free trunk
@@ -239,9 +250,6 @@ def build_model(
         spec.body("trunk").pos, spec.body("trunk").quat = [0.0, 0.0, HELD_HEIGHT], list(held)
         if mounted:
             add_mount(spec.body("trunk"))
-    for geom in list(spec.geoms):
-        if terrain is None or (geom.group == DECORATION_GROUP and not decoration):
-            spec.delete(geom)
     spec.option.timestep = physics_dt
     # A fault must be seen, not healed: MuJoCo would otherwise reset a robot whose state is not finite.
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
