@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from hydra._internal import defaults_list
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.core_plugins.importlib_resources_config_source import ImportlibResourcesConfigSource
 from hydra.core.config_store import ConfigStore
 
 from go1exp.config.hydra_adapter import VerbSource, _stamps
@@ -20,7 +21,20 @@ OWN = frozenset(ConfigStore.instance().repo)
 """Names of Hydra's own nodes; others come from a user's file, for one command."""
 
 merge, choices_of = ConfigLoaderImpl._compose_config_from_defaults_list, defaults_list._create_interpolation_map
-merged: dict[tuple[Any, ...], bytes] = {}
+read_packaged = ImportlibResourcesConfigSource.load_config
+kept: dict[tuple[Any, ...], bytes] = {}
+
+
+def copied(key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
+    """Return a copy of what ``make`` returned when it was called for this key first."""
+    if key not in kept:
+        kept[key] = pickle.dumps(make())
+    return pickle.loads(kept[key])
+
+
+def packaged_once(self: ImportlibResourcesConfigSource, config_path: str) -> Any:
+    """Return a copy of a file that Hydra brings along."""
+    return copied((self.path, config_path), lambda: read_packaged(self, config_path))
 
 
 def merged_once(self: ConfigLoaderImpl, defaults: Sequence[Any], repo: Any) -> Any:
@@ -29,10 +43,7 @@ def merged_once(self: ConfigLoaderImpl, defaults: Sequence[Any], repo: Any) -> A
         return merge(self, list(defaults), repo)
     sources = tuple((source.scheme(), source.path) for source in repo.get_sources())
     state = tuple(_stamps(path) for scheme, path in sources if scheme in ("file", VerbSource.scheme()))
-    key = (repr(defaults), sources, state)
-    if key not in merged:
-        merged[key] = pickle.dumps(merge(self, list(defaults), repo))
-    return pickle.loads(merged[key])
+    return copied((repr(defaults), sources, state), lambda: merge(self, list(defaults), repo))
 
 
 def choices_where_needed(overrides: Any, listed: Sequence[Any], *rest: Any) -> Any:
@@ -61,5 +72,6 @@ def of_a_recording(check: Callable[[Any], Any], recording_of: Callable[[Any], Re
 def install() -> None:
     """Let this process work so."""
     ConfigLoaderImpl._compose_config_from_defaults_list = merged_once  # type: ignore[method-assign]
+    ImportlibResourcesConfigSource.load_config = packaged_once  # type: ignore[method-assign]
     defaults_list._create_interpolation_map = choices_where_needed
     checks._run_checks = of_a_recording(checks._run_checks, lambda log: log.recording)
