@@ -55,7 +55,7 @@ def parse(kind: type[T], container: Mapping[str, Any], examples: Mapping[str, st
         hints = examples or {}
         raise ConfigError([f"{key}: required, such as {hints.get(key, f'{key}=...')}" for key in absent])
     try:
-        return adapter(kind).validate_json(as_json(container))
+        return adapter(kind).validate_json(as_json(container))  # type: ignore[arg-type]
     except ValidationError as error:
         raise ConfigError(explain(error, path, [f.name for f in fields(kind)])) from None  # type: ignore[arg-type]
 
