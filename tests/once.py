@@ -73,5 +73,5 @@ def install() -> None:
     """Let this process work so."""
     ConfigLoaderImpl._compose_config_from_defaults_list = merged_once  # type: ignore[method-assign]
     ImportlibResourcesConfigSource.load_config = packaged_once  # type: ignore[method-assign]
-    defaults_list._create_interpolation_map = choices_where_needed
-    checks._run_checks = of_a_recording(checks._run_checks, lambda log: log.recording)
+    defaults_list._create_interpolation_map = choices_where_needed  # type: ignore[assignment]
+    checks._run_checks = of_a_recording(checks._run_checks, lambda log: log.recording)  # type: ignore[assignment]
