@@ -72,7 +72,7 @@ GRAMMAR = re.compile(r"See https://hydra\.cc/docs/\S+/basic for details")
 
 def read_yaml(file: Path, resolve: bool = False) -> Any:
     """Return the content of a YAML file as plain data, ``1e3`` a number, as OmegaConf does; raise ``UNREADABLE``."""
-    return OmegaConf.to_container(OmegaConf.create(loaded(file.read_text("utf-8"), _fast_loader())), resolve=resolve)
+    return OmegaConf.to_container(OmegaConf.create(loaded(file.read_text("utf-8"), get_yaml_loader())), resolve=resolve)
 
 
 def to_yaml(container: Mapping[str, object]) -> str:
