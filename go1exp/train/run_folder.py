@@ -143,8 +143,8 @@ def _meta(container: Mapping[str, object]) -> dict[str, object]:
 @cache
 def _installed() -> dict[str, str]:
     """Return the version of each package that is installed, by name."""
-    found = [(d.name, d.version) for d in importlib.metadata.distributions()]
-    return dict(sorted(found, key=lambda pair: pair[0]))
+    packages = [(d.name, d.version) for d in importlib.metadata.distributions()]
+    return dict(sorted(packages, key=lambda pair: pair[0]))
 
 
 def _git(*arguments: str, folder: Path | None = None) -> str | None:
