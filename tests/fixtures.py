@@ -21,11 +21,9 @@ from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.actuator.actuator_net import ActuatorNet, NetInfo, Provenance, group_names
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TaskConfig, parse_task
-from tests import once
 from tests.small_run import made_once, plain, trained
 
 torch.set_num_threads(1)
-once.install()
 
 
 @cache
