@@ -9,10 +9,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from functools import cache
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 import go1exp.mdp  # noqa: F401  (registers every term)
 from go1exp import robot
@@ -33,6 +32,7 @@ from go1exp.config.schema.registry import (
     one_of,
     unknown_name,
 )
+from go1exp.config.schema.settings import adapter
 from go1exp.config.schema.training import BESIDE, EVALUATED, EstimatorConfig, EvalDuring, Ramp, StopRule, VideoDuring
 from go1exp.config.schema.training import CheckpointConfig as CheckpointConfig
 from go1exp.config.schema.training import LoggerConfig as LoggerConfig
@@ -239,17 +239,12 @@ REGISTERED_AS = {"critic": "observation"}
 """Groups whose terms are those of another group."""
 
 
-@cache
-def _adapter(kind: Any) -> TypeAdapter[Any]:
-    return TypeAdapter(kind)
-
-
 def _section(kind: type, settings: object, path: str) -> tuple[Any, list[str]]:
     """Validate one section; return the dataclass (or None) and the problems."""
     if not isinstance(settings, Mapping):
         return None, [f"{path} = {settings!r}: must be a mapping"]
     try:
-        return _adapter(kind).validate_json(as_json(settings)), []
+        return adapter(kind).validate_json(as_json(settings)), []
     except ValidationError as error:
         return None, explain(error, path, [f.name for f in fields(kind)])
 
