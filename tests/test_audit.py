@@ -295,7 +295,12 @@ def test_the_step_of_each_column_is_measured_once(monkeypatch: pytest.MonkeyPatc
     """Each target is compared with each angle; a step for each pair would take a third of an audit."""
     asked: list[int] = []
     measure = signals.quantum
-    monkeypatch.setattr(signals, "quantum", lambda values: asked.append(len(values)) or measure(values))
+
+    def noted(values: np.ndarray) -> float:
+        asked.append(len(values))
+        return measure(values)
+
+    monkeypatch.setattr(signals, "quantum", noted)
     audit(made("chirp"))
     assert 0 < len(asked) <= len(made("chirp").channels)
 

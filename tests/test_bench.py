@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -22,7 +24,7 @@ def test_the_least_update_has_the_products_of_an_update(symmetry: bool) -> None:
     with FlopCounterMode(display=False) as least:
         steps = env.products_subject(ppo)()
     assert steps == ppo.n_envs * ppo.n_steps
-    networks = ppo.policy.mlp_extractor
+    networks: Any = ppo.policy.mlp_extractor
     first = sum(net[0].weight.numel() for net in (networks.policy_net, networks.value_net))
     rows = ppo.n_epochs * ppo.n_envs * ppo.n_steps * (2 if symmetry else 1)
     assert least.get_total_flops() - 2 * rows * first == whole.get_total_flops()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from typing import Any, TypeVar, dataclass_transform, get_args, get_type_hints
@@ -31,10 +31,8 @@ def settings(kind: type[T]) -> type[T]:
     return pydantic_dataclass(kind, frozen=True, kw_only=True, config=STRICT)  # type: ignore[return-value]
 
 
-@cache
-def adapter(kind: type[T]) -> TypeAdapter[T]:
-    """Return what checks data of ``kind``; to make one takes milliseconds."""
-    return TypeAdapter(kind)
+adapter: Callable[[Any], TypeAdapter[Any]] = cache(TypeAdapter)
+"""What checks data of a type, made once for each: to make one takes milliseconds."""
 
 
 def parse(kind: type[T], container: Mapping[str, Any], examples: Mapping[str, str] | None = None, path: str = "") -> T:
@@ -55,7 +53,7 @@ def parse(kind: type[T], container: Mapping[str, Any], examples: Mapping[str, st
         hints = examples or {}
         raise ConfigError([f"{key}: required, such as {hints.get(key, f'{key}=...')}" for key in absent])
     try:
-        return adapter(kind).validate_json(as_json(container))  # type: ignore[arg-type]
+        return adapter(kind).validate_json(as_json(container))
     except ValidationError as error:
         raise ConfigError(explain(error, path, [f.name for f in fields(kind)])) from None  # type: ignore[arg-type]
 
