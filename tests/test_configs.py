@@ -72,7 +72,7 @@ OTHERS = {"none", "no_curriculum", "no_phases", "no_schedule", *DEPARTURES_OF_TH
 ABLATIONS = [
     name for c in choices() if c.startswith("experiment=ablation/") and (name := c.split("/")[1]) not in OTHERS
 ]
-NEEDS = {"curriculum=terrain_level": ["terrain=rough"]}
+NEEDS = {"curriculum=terrain_level": ["terrain=rough"], "estimator=decoder": ["critic=privileged"]}
 
 
 ELSEWHERE = ("experiment=ablation/", "experiment=minute_part/", "effect=")

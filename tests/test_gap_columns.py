@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from go1exp.gap.comparison import compare, robot_from
-from go1exp.gap.replay.rows import Probe, Theta, variants
+from go1exp.gap.replay.rows import Probe, Theta
 from go1exp.gap.result import GapSettings
 from go1exp.gap.score.likelihood import Scorer, log_chi2
 from go1exp.gap.score.linear import Layout, Table, borrowed, corrected, unbiased_grams
@@ -41,15 +41,6 @@ def hung() -> State:
 def linear(hung: State) -> Table:
     """The linear model about the nominal values."""
     return hung.linear({}, hung.splits.train)
-
-
-def test_rows_are_replayed_with_less_than_a_vector_of_eight_to_spare(hung: State) -> None:
-    replayer, made = hung.scorer.replayer, []
-    for count in (8, 297):
-        before = replayer.made
-        replayer.run(variants(hung.machine, {}, np.zeros(count, dtype=int), []), 4.0 * hung.dt)
-        made.append(replayer.made - before)
-    assert made[1] == 38 * made[0]
 
 
 def test_a_corrected_model_says_what_the_step_did_and_keeps_what_it_did_not_try(hung: State, linear: Table) -> None:

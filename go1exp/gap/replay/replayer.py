@@ -192,8 +192,9 @@ def hold(backend: PhysicsBackend, quats: np.ndarray) -> None:
 
 
 def padded(rows: int) -> int:
-    """Return how many simulations to make for ``rows``: whole vectors of eight, for the same bits wherever a row is."""
-    return -(-rows // 8) * 8
+    """Return how many simulations to make for ``rows``: at most a quarter, or 7, more, so that few sizes are built."""
+    step = min(max(8, 1 << max(rows.bit_length() - 3, 0)), 64)  # whole vectors of eight: same bits wherever a row is
+    return -(-rows // step) * step
 
 
 def _sampled(q: np.ndarray, qd: np.ndarray, torque: np.ndarray | None, at: np.ndarray, dt: float) -> np.ndarray:

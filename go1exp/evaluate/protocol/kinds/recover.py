@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field
-from torch import Tensor
 
 from go1exp import robot
 from go1exp.base.report import plots
@@ -19,10 +18,12 @@ from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, lives
 from go1exp.evaluate.protocol.plan import NEVER, Array, Brake, Braking, Impulse, Impulses, Plan, Signal
 from go1exp.evaluate.quantities import ROBOT, Column, Derived, Row, Summaries, values
-from go1exp.mdp.types import Snapshot
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from go1exp.evaluate.protocol.stage import Stage
+    from go1exp.mdp.types import Snapshot
 
 LYING, PUSHED = ("side", "back"), "pushed"
 FIGURES = 3  # of ``posture``
