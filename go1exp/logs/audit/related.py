@@ -135,7 +135,7 @@ def torque(log: Log) -> Iterator[Finding]:
 
 def _masked_correlation(a: np.ndarray, b: np.ndarray, use: np.ndarray) -> np.ndarray:
     """Return the correlation (J,), about zero, of the columns of ``a`` and ``b`` (T, J) where ``use`` is set."""
-    a, b = a * use, b * use
+    a, b = np.where(use, a, 0.0), np.where(use, b, 0.0)
     aa, ab, bb = (np.einsum("tj,tj->j", *pair) for pair in ((a, a), (a, b), (b, b)))
     spread = np.sqrt(aa * bb)
     return np.divide(ab, spread, out=np.zeros(a.shape[1]), where=spread > 0)
