@@ -82,7 +82,7 @@ def _controller_law(log: Log) -> np.ndarray:
         return signs
     names = [name for name in ("q_target", "q", "qd", "tau_est") if r.has(name)]
     series = np.stack([r.joint(name).T for name in names], axis=1)  # (J, K, T)
-    alike = [abs(signals.correlation(*pair)) > limits.ALIKE for pair in series[:, :2]]  # their factors are one
+    inseparable = [abs(signals.correlation(*pair)) > limits.ALIKE for pair in series[:, :2]]  # their factors are one
     for lag in range(0, log.samples(limits.TORQUE_LAG) + 1, log.samples(0.002)):
         late = np.concatenate([series[:, :1, : len(log.t) - lag], series[:, 1:, lag:]], axis=1)[:, :, log.on[lag:]]
         late -= late.mean(axis=2, keepdims=True)
@@ -91,7 +91,7 @@ def _controller_law(log: Log) -> np.ndarray:
         factors = (np.linalg.pinv(about[:, :-1, :-1], hermitian=True) @ about[:, :-1, -1:])[:, :, 0]
         explained = np.sum(factors * about[:, :-1, -1], axis=1) / np.maximum(torque, 1e-12)
         parts = factors[:, :2] ** 2 * np.diagonal(about, axis1=1, axis2=2)[:, :2]
-        better = (explained > best) & (parts.min(axis=1) > limits.LAW_PART**2 * torque) & ~np.array(alike)
+        better = (explained > best) & (parts.min(axis=1) > limits.LAW_PART**2 * torque) & ~np.array(inseparable)
         best = np.where(better, explained, best)
         signs = np.where(better, -np.sign(factors[:, 0] * factors[:, 1]), signs)
     return signs
