@@ -77,6 +77,7 @@ EXEMPT = {
     "controller/mpc.yaml:controller": "tests/test_controller.py shows what each key does",
     "controller/policy.yaml:controller": "the name of the choice",
     "experiment/ablation/*.yaml:schedule": "ramps that are taken away with their rows, or wait for another one",
+    "experiment/rough.yaml:reward.foot_clock.excess": "of feet higher than asked, which come later: test_rewards",
     "reward/paper_literal.yaml:reward.air_time_variance.weight": "as printed, the term is zero for every gait",
     "launcher/*.yaml:launcher": "needs several cores, or a cluster: tests/test_sweeps.py, test_slurm.py",
     "study/*.yaml:study": "jobs of a sweep: tests/test_configs.py",
@@ -144,6 +145,7 @@ NEEDS = {
     "experiment/study": ["backend=cpu", "ppo=warp"],
     "experiment/robust": ["experiment=clock", "backend=cpu"],
     "experiment/robust_history": ["experiment=robust", "backend=cpu"],
+    "experiment/rough": ["experiment=robust_history", "terrain=steps", "observation=proprioception", "backend=cpu"],
 }
 """Choices that other choices must go with."""
 

@@ -29,7 +29,7 @@ SMALL = (
     *("terrain=rough", "terrain.rows=4", "terrain.cols=3", "curriculum=terrain_level"),
     *("curriculum.terrain_level.start_level_max=3", "observation=clock"),
     *("rand=table1", "sim.episode_s=0.2", "ppo.symmetry=true", "critic=privileged", "ppo.iterations=2"),
-    *("backend.threads=1", "torch_threads=1", "logger=local"),
+    *("backend.threads=1", "torch_threads=1", "logger=local", "schedule=none"),
 )
 
 

@@ -205,6 +205,7 @@ CASES = [
     Case("foot_clock", "the other swing", {**THIRD, "foot_height": feet(FL=0.083, RR=0.083)}, 1.0),
     Case("foot_clock", "another rate", QUARTER, 0.0, {"rate": 1.25, "height": 0.1}),
     # Two feet 0.06 of 0.12 m up: each half a height off.
+    Case("foot_clock", "excess", {**QUARTER, "foot_height": [0.113, 0.053, 0.023, 0.083]}, 0.375, {"excess": 0.25}),
     Case("foot_clock", "half as high", {**QUARTER, "foot_height": [0.083, 0.023, 0.023, 0.083]}, 0.0, {"height": 0.12}),
     Case("foot_clock", "told to turn", {**TURNING, "foot_height": [0.083, 0.02, 0.023, 0.083]}, 1.0),
     Case("foot_clock", "nothing without a command", {**QUARTER, "command": [0.0] * 3}, 0.0),

@@ -23,20 +23,22 @@ RUNTIME = "from go1exp.deploy.__main__ import main; sys.exit(main(sys.argv[1:]))
 
 
 @pytest.mark.parametrize(
-    ("arguments", "module", "name"),
+    ("arguments", "module", "name", "announced"),
     [
-        ("gap logs=nowhere", "hydra", "SIGINT"),
-        pytest.param("eval policy=paper", "torch", "SIGINT", marks=WORKING),
-        pytest.param("play policy=paper", "mujoco", "SIGHUP", marks=WORKING),
-        pytest.param("record", "mujoco", "SIGTERM", marks=WORKING),
-        ("train", "stable_baselines3", "SIGINT"),
-        ("deploy nowhere.zip", "numpy", "SIGINT"),
+        ("gap logs=nowhere", "hydra", "SIGINT", ""),
+        pytest.param("eval policy=paper", "torch", "SIGINT", "evaluating ...\n", marks=WORKING),
+        pytest.param("play policy=paper", "mujoco", "SIGHUP", "recording a video ...\n", marks=WORKING),
+        pytest.param("record", "mujoco", "SIGTERM", "recording ...\n", marks=WORKING),
+        ("train", "stable_baselines3", "SIGINT", ""),
+        ("deploy nowhere.zip", "numpy", "SIGINT", ""),
     ],
 )
-def test_a_signal_at_any_time_is_one_line_and_a_status(arguments: str, module: str, name: str, tmp_path: Path) -> None:
+def test_a_signal_at_any_time_is_one_line_and_a_status(
+    arguments: str, module: str, name: str, announced: str, tmp_path: Path
+) -> None:
     code = WHILE_LOADING.format(module=module, name=name, program=COMMAND_LINE)
     done = run_alone(tmp_path, *arguments.split(), code=code)
-    assert (done.returncode, done.stderr) == (130, f"go1exp {arguments.split()[0]}: stopped\n")
+    assert (done.returncode, done.stderr) == (130, f"{announced}go1exp {arguments.split()[0]}: stopped\n")
     assert not list(tmp_path.rglob(".hydra"))
 
 
