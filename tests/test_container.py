@@ -221,8 +221,8 @@ def test_the_lines_of_the_dockerfile_make_a_runtime_that_walks(tmp_path: Path, m
     assert 2.0 - 0.5 / 50 < account["walked_s"] < 2.0 + (account["timing"]["missed"] + 1) / 50
     found = recording.read(file)
     assert (found.meta.tool, found.meta.source, found.meta.excitation) == ("go1exp deploy", "simulated", "policy")
-    # By the robot's clock, which loses what its process cannot make up for.
-    lasted = 0.5 + account["walked_s"]
+    # By the robot's clock, which loses what its process cannot make up for; rows of standing up have other gains.
+    lasted = account["walked_s"]
     assert lasted - robot.report["slipped"] - 0.1 < found.t[-1] - found.t[0] < lasted + 0.1
     assert np.ptp(found.joint("q"), axis=0).max() > 0.2  # its legs went
     assert robot.report["commands"] > 100
