@@ -74,7 +74,7 @@ LOSS_FIGURES = (
     "approx_kl",
     "estimator_loss",
 )
-"""SB3's names for the fields of ``Loss``, in their order."""
+"""Names for the fields of ``Loss``, in their order: SB3's, and one for the estimator."""
 
 
 class MeanRolloutBuffer(RolloutBuffer):
