@@ -344,7 +344,7 @@ def _culprit(verb: str, overrides: Sequence[str], folders: tuple[Path, ...]) -> 
             return Refusal("key", o.key_or_group)
     config = _with_choices(verb, [o for o in choices if not _needs_hydra(o)], folders)
     for o in values:
-        if o.package or o.is_sweep_override():
+        if o.package or o.is_sweep_override() or o.key_or_group.startswith("hydra."):  # Hydra's own, not in ``config``
             continue
         exists = OmegaConf.select(config, o.key_or_group, throw_on_missing=False) is not None
         try:
@@ -352,8 +352,8 @@ def _culprit(verb: str, overrides: Sequence[str], folders: tuple[Path, ...]) -> 
         except REFUSED as error:
             if o.is_add() and exists:
                 return Refusal("present", o.key_or_group)
-            if not exists and (o.is_delete() or isinstance(error.__cause__, AttributeError | KeyError)):
-                return Refusal("key", o.key_or_group)
+            if (o.is_delete() and not exists) or isinstance(error.__cause__, AttributeError | KeyError):
+                return Refusal("key", (exists and getattr(error.__cause__, "full_key", "")) or o.key_or_group)
             return None
     return None
 
