@@ -60,7 +60,12 @@ CHANGING = (
 
 
 @pytest.mark.parametrize(
-    "choices", [(*ROUGH, "+observation.height_scan={}"), ("experiment=clock", "backend=cpu"), ("reward=paper_literal",)]
+    "choices",
+    [
+        (*ROUGH, "+observation.height_scan={}", "+reward.ahead={term: foot_clock_ahead, weight: 1.0}"),
+        ("experiment=clock", "backend=cpu"),
+        ("reward=paper_literal",),
+    ],
 )
 def test_a_step_holds_nothing_that_a_graph_cannot(choices: tuple[str, ...], start_core: Callable[..., Go1Core]) -> None:
     core = start_core(*choices)

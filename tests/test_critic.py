@@ -14,7 +14,7 @@ from go1exp.config.compose import compose
 from go1exp.config.schema import plugins
 from go1exp.config.schema.registry import ConfigError, members
 from go1exp.deploy.export.build import build
-from go1exp.mdp.ground import SCAN_COLUMNS, SCAN_ROWS, GroundHeight, HeightScan
+from go1exp.mdp.ground import SCAN_COLUMNS, SCAN_ROWS, GroundHeight, HeightScan, RiseAhead
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.sb3_env import Go1VecEnv
 from go1exp.sim.task import TrainConfig, parse_train
@@ -209,6 +209,45 @@ def test_the_ground_is_scanned_only_for_whom_reads_it_and_is_that_of_the_terrain
     assert heights is not None
     torch.testing.assert_close(observed, (5.0 * (heights + 0.3)).clamp(-1.0, 1.0))
     assert observed.std() > 0.0
+
+
+@pytest.mark.parametrize("yaw", [0.0, 2.0])
+@pytest.mark.parametrize("command", [(1.0, 0.0, 0.3), (-0.2, 0.5, 0.0), (0.0, 0.0, 1.0)])
+def test_the_rise_is_that_of_the_ground_where_the_command_leads_each_foot(
+    yaw: float, command: tuple[float, float, float]
+) -> None:
+    heights = np.random.default_rng(0).uniform(0.0, 0.3, (60, 60))
+    ground = GroundHeight(torch.as_tensor(heights), -3.0, -3.0, 0.1)
+    feet = np.array([[0.2, -0.1], [0.25, 0.13], [-0.2, -0.15], [-0.21, 0.12]])
+    attitude = Rotation.from_euler("ZY", [yaw, 0.3]).as_quat(scalar_first=True)
+    rise = RiseAhead(ground, torch.device("cpu"))(
+        torch.as_tensor(feet)[None], torch.as_tensor(attitude)[None], torch.tensor([command], dtype=torch.float64)
+    )
+    course = yaw + np.arctan2(command[1], command[0])
+    for foot, found in zip(feet, rise[0], strict=True):
+        reach = np.linspace(0.0, 0.2, 5) * (np.hypot(*command[:2]) > 0.0)
+        way = foot + reach[:, None] * [np.cos(course), np.sin(course)]
+        there = [float(ground(torch.as_tensor(point))) for point in way]
+        assert float(found) == pytest.approx(max(there) - there[0], abs=1e-6)
+
+
+def test_the_rise_is_computed_only_for_a_reward_that_reads_it_and_is_0_on_flat_ground() -> None:
+    ahead = "+reward.ahead={term: foot_clock_ahead, weight: 1.0}"
+    rough = ("terrain=rough", "terrain.cols=2", "terrain.border=2.0", "rand=none", "event=none")
+    assert Go1Core(settings("rand=none").task, 2).snapshot().foot_rise is None
+    for choices in (("rand=none", ahead), (*rough, ahead)):
+        core = Go1Core(settings(*choices).task, 4, noise=False)
+        core.reset()
+        core.command.value.copy_(torch.tensor([1.0, 0.0, 0.0]))
+        rise = core.snapshot().foot_rise
+        assert rise is not None
+        assert rise.shape == (4, 4)
+        assert rise.max() == 0.0  # of the platform too
+        core.backend.qpos[:, 0] += 1.5
+        core.step(torch.zeros(4, 12))
+        rise = core.snapshot().foot_rise
+        assert rise is not None
+        assert (rise.max() > 0.01) == ("terrain=rough" in choices)
 
 
 MEMORY = '''

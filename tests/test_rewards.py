@@ -70,6 +70,7 @@ def snapshot(n: int = 1, **changes: Any) -> Snapshot:
         "trunk_contact": False,
         "episode_time": 1.0,
         "height_scan": [-0.33] * 187,
+        "foot_rise": [0.0] * 4,
     }
     assert rest.keys() == {f.name for f in fields(Snapshot)}
     assert changes.keys() <= rest.keys()
@@ -118,6 +119,7 @@ PACE_PHASE = {"foot_air_time": feet(FR=0.1, RR=0.1), "foot_contact_time": feet(F
 BOUND_PHASE = {"foot_air_time": feet(FR=0.1, FL=0.1), "foot_contact_time": feet(RR=0.1, RL=0.1)}
 PRONK_PHASE = {"foot_air_time": [0.1] * 4, "foot_contact_time": [0.0] * 4}
 LANDING = {"foot_touchdown_speed": [1.5, 2.0, 0.5, 9.0], "foot_touchdown": [True, False, True, False]}
+STEP = {"foot_rise": feet(FR=0.15)}
 QUARTER, THIRD = {"command": WALK, "episode_time": 0.1}, {"command": WALK, "episode_time": 0.3}
 TURNING = {"command": [0.0, 0.0, 0.5], "episode_time": 0.1}
 APART = {"foot_air_time": [0.0, 1.0, 2.0, 3.0], "foot_contact_time": [10.0, 20.0, 30.0, 40.0]}
@@ -209,6 +211,14 @@ CASES = [
     Case("foot_clock", "half as high", {**QUARTER, "foot_height": [0.083, 0.023, 0.023, 0.083]}, 0.0, {"height": 0.12}),
     Case("foot_clock", "told to turn", {**TURNING, "foot_height": [0.083, 0.02, 0.023, 0.083]}, 1.0),
     Case("foot_clock", "nothing without a command", {**QUARTER, "command": [0.0] * 3}, 0.0),
+    # The same, FR before a step of 0.15 m: 0.2 m up.
+    Case("foot_clock_ahead", "level ground", {**QUARTER, "foot_height": [0.083, 0.02, 0.023, 0.083]}, 1.0),
+    Case("foot_clock_ahead", "over the step", {**QUARTER, **STEP, "foot_height": [0.223, 0.02, 0.023, 0.083]}, 1.0),
+    Case("foot_clock_ahead", "too low for it", {**QUARTER, **STEP, "foot_height": [0.083, 0.02, 0.023, 0.083]}, 0.3),
+    Case("foot_clock_ahead", "a low one", {**QUARTER, "foot_rise": feet(FR=0.01), "foot_height": [0.083] * 4}, -1.0),
+    Case(
+        "foot_clock_ahead", "less to spare", {**QUARTER, **STEP, "foot_height": [0.083] * 4}, -1.625, {"margin": 0.01}
+    ),
     # A quarter turn: FL and RR should bear the weight.
     Case("load_clock", "standing feet", QUARTER, 0.0),
     Case("load_clock", "all of it", {**QUARTER, "foot_force": feet(FL=60.0, RR=70.0)}, 1.0),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import TYPE_CHECKING
 
 import torch
@@ -14,6 +15,9 @@ SCAN_ROWS, SCAN_COLUMNS = 17, 11
 
 SCAN_SPACING = 0.1
 """Distance between its points, m: 1.6 m x 1.0 m with the trunk's origin in the middle, as in Isaac Lab."""
+
+AHEAD = (0.0, 0.05, 0.1, 0.15, 0.2)
+"""Distances from a foot at which the ground ahead of it is looked at, m; a stride at 0.5 m/s and 2.8 Hz is 0.18 m."""
 
 
 class GroundHeight:
@@ -72,9 +76,64 @@ class HeightScan:
         below = -position[:, 2:].expand(-1, len(self._grid))
         if self._ground is None:
             return below
-        w, x, y, z = quat.unsqueeze(1).unbind(-1)
-        ahead = torch.stack([1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)], dim=-1)  # the x axis, seen from above
-        ahead = ahead / ahead.norm(dim=-1, keepdim=True).clamp(min=1e-6)
-        left = torch.stack([-ahead[..., 1], ahead[..., 0]], dim=-1)
-        points = position[:, None, :2] + self._grid[:, :1] * ahead + self._grid[:, 1:] * left
+        points = position[:, None, :2] + _turned(self._grid, quat)
         return self._ground(points) + below
+
+
+class RiseAhead:
+    """How far the ground ahead of each foot rises over the ground below the foot.
+
+    Args:
+        ground: lookup of heights; None for flat ground.
+        device: of the distances.
+    """
+
+    def __init__(self, ground: GroundHeight | None, device: torch.device) -> None:
+        self._ground, self._distances = ground, torch.tensor(AHEAD, device=device).unsqueeze(1)
+
+    def __call__(self, feet: Tensor, quat: Tensor, command: Tensor) -> Tensor:
+        """Return (N, 4), m, not negative: of the highest point at the distances ``AHEAD`` where the command leads.
+
+        Args:
+            feet: (N, 4, 2) world positions of the feet, m.
+            quat: (N, 4) attitude of the trunk, w-x-y-z.
+            command: (N, 3) commanded velocity, body frame. Without a planar one nothing lies ahead.
+        """
+        if self._ground is None:
+            return torch.zeros_like(feet[..., 0])
+        towards = _turned(command[:, None, :2], quat)  # (N, 1, 2)
+        towards = towards / towards.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+        heights = self._ground(feet.unsqueeze(2) + (self._distances * towards).unsqueeze(1))  # (N, 4, len(AHEAD))
+        return heights.amax(-1) - heights[..., 0]
+
+
+class Surroundings:
+    """The fields of a Snapshot that are computed only because a term reads them.
+
+    Args:
+        ground: lookup of heights; None for flat ground at height 0.
+        device: of the robots.
+        read: names of the fields; others than ``height_scan`` and ``foot_rise`` are not looked at.
+    """
+
+    def __init__(self, ground: GroundHeight | None, device: torch.device, read: Collection[str]) -> None:
+        self._scan = HeightScan(ground, device) if "height_scan" in read else None
+        self._rise = RiseAhead(ground, device) if "foot_rise" in read else None
+
+    def __call__(self, position: Tensor, quat: Tensor, feet: Tensor, command: Tensor) -> dict[str, Tensor]:
+        """Return the fields that are read; arguments as in ``HeightScan`` and ``RiseAhead``."""
+        fields = {}
+        if self._scan:
+            fields["height_scan"] = self._scan(position, quat)
+        if self._rise:
+            fields["foot_rise"] = self._rise(feet, quat, command)
+        return fields
+
+
+def _turned(vectors: Tensor, quat: Tensor) -> Tensor:
+    """Return level vectors (N or 1, K, 2) of the trunks' headings in the world frame, (N, K, 2); ``quat`` (N, 4)."""
+    w, x, y, z = quat.unsqueeze(1).unbind(-1)
+    ahead = torch.stack([1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)], dim=-1)  # the x axis, seen from above
+    ahead = ahead / ahead.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+    left = torch.stack([-ahead[..., 1], ahead[..., 0]], dim=-1)
+    return vectors[..., :1] * ahead + vectors[..., 1:] * left

@@ -114,6 +114,29 @@ def foot_clock(s: Snapshot, *, rate: Positive = 2.5, height: Positive = 0.06, ex
     1; 0 while no motion is commanded. Of what a swinging foot is higher than h_i the share ``excess`` counts: less than
     1 lets feet clear steps. Not in Table III; after Siekmann et al., arXiv 2011.01387, heights for forces.
     """
+    return _following(s, rate, height, excess)
+
+
+@reward("foot_clock_ahead", reads=("foot_rise",))
+def foot_clock_ahead(
+    s: Snapshot,
+    *,
+    rate: Positive = 2.5,
+    height: Positive = 0.06,
+    excess: Fraction = 1.0,
+    margin: NonNegative = 0.05,
+) -> Tensor:
+    """As ``foot_clock``, with feet that clear what lies ahead: ``height`` or rise + ``margin``, whichever is more.
+
+    The rise is that of the ground up to 0.2 m ahead of the foot, where the command leads (``RiseAhead``), m. It tells a
+    foot at the bottom of a riser how much higher it must be; the robot itself sees nothing of it. Not in Table III.
+    """
+    assert s.foot_rise is not None
+    return _following(s, rate, (s.foot_rise + margin).clamp(min=height), excess)
+
+
+def _following(s: Snapshot, rate: float, height: Tensor | float, excess: float) -> Tensor:
+    """Return ``foot_clock`` with a ``height`` for all feet or for each, (N, 4), m."""
     lift = torch.sin(clock_angle(s, rate)).unsqueeze(-1) * constant_like(DIAGONAL_SIGNS, s.foot_height)
     wanted = lift.clamp(min=0.0).square()
     sole = (s.foot_height - robot.FOOT_RADIUS).clamp(min=0.0) / height

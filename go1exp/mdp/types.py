@@ -100,6 +100,9 @@ class Snapshot:
     height_scan: Tensor | None = None
     """(N, 187) height of the ground over the trunk's origin, m, on the grid of ``mdp/ground.py``; None unless an
     observation reads it."""
+    foot_rise: Tensor | None = None
+    """(N, 4) rise of the ground up to 0.2 m ahead of each foot, where the command leads, over the ground below the
+    foot, not negative, m; None unless a reward reads it."""
 
 
 @dataclass(frozen=True)

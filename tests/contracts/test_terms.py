@@ -43,6 +43,7 @@ def test_the_mirror_is_a_mirror() -> None:
 
 ONE_SIDED = {
     "foot_clock": "a clock that begins with FR and RL begins with FL and RR in the mirror",
+    "foot_clock_ahead": "the same",
     "load_clock": "the same",
     "base_motion_literal": "a roll changes sign in the mirror, a pitch does not",
     "joint_deviation_literal": "hip angles change sign in the mirror",
@@ -71,7 +72,7 @@ def test_a_reward_is_the_same_in_the_mirror_unless_it_is_known_not_to_be(entry: 
     assert same == (entry.name not in ONE_SIDED)
 
 
-@pytest.mark.parametrize("name", ["foot_clock", "load_clock"])
+@pytest.mark.parametrize("name", ["foot_clock", "foot_clock_ahead", "load_clock"])
 def test_a_reward_of_the_gait_clock_is_the_same_in_the_mirror_half_a_turn_later(name: str) -> None:
     s, entry = random_snapshot(500), members("reward")[name]
     image = replace(mirrored(s), episode_time=s.episode_time + 0.2)  # of 2.5 turns a second
@@ -81,7 +82,7 @@ def test_a_reward_of_the_gait_clock_is_the_same_in_the_mirror_half_a_turn_later(
 @each("reward")
 def test_a_penalty_or_reward_is_not_negative_unless_it_is_signed(entry: Entry) -> None:
     signed = {"feet_air_time", "feet_air_time_touchdown", "feet_air_time_literal", "joint_deviation_literal"}
-    signed |= {"foot_clock", "load_clock"}
+    signed |= {"foot_clock", "foot_clock_ahead", "load_clock"}
     if entry.name not in signed | {"air_time_variance_literal"}:
         assert once(entry, random_snapshot(500)).min() >= 0.0
 

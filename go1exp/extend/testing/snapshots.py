@@ -60,6 +60,7 @@ def random_snapshot(n: int, seed: int = 0) -> Snapshot:
         "trunk_contact": rng.random(n) < 0.3,
         "episode_time": rng.uniform(0.0, 20.0, n),
         "height_scan": rng.uniform(-0.6, 0.0, (n, SCAN_ROWS * SCAN_COLUMNS)),
+        "foot_rise": rng.uniform(-0.1, 0.2, (n, 4)).clip(min=0.0),
     }
     assert values.keys() == {f.name for f in fields(Snapshot)}
     tensors = {k: torch.as_tensor(v) for k, v in values.items()}

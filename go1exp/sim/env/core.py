@@ -24,7 +24,7 @@ from go1exp.mdp.commands import UniformVelocity
 from go1exp.mdp.curricula import TrackedPath
 from go1exp.mdp.derived import clipped, joint_target, of_shape
 from go1exp.mdp.feet import Feet
-from go1exp.mdp.ground import GroundHeight, HeightScan
+from go1exp.mdp.ground import GroundHeight, Surroundings
 from go1exp.mdp.kinematics import KinematicState, lift
 from go1exp.mdp.types import Snapshot, StepResult
 from go1exp.sim.effects.rules import on_mount
@@ -136,7 +136,7 @@ class Go1Core:
         self.events = {t.key: watched("event", t, t(self.random.stream(f"event.{t.key}"))) for t in task.event}
         self.observation_size = self.terms.observation_size
         ground = self._ground if self._bounded else None
-        self._scan = HeightScan(ground, self.device) if "height_scan" in self.terms.read else None
+        self._around = Surroundings(ground, self.device, self.terms.read)
         self._model_terms = [t for t in task.rand if t.entry.traits["kind"] == "model"]
         self._state_terms = [t for t in task.rand if t.entry.traits["kind"] == "state"]
         for term in self._model_terms:
@@ -328,7 +328,7 @@ class Go1Core:
             calf_contact=self._calf_touched > 0,
             trunk_contact=(self._touched[:, TRUNK] > 0).any(-1),
             episode_time=self.steps * self.task.sim.policy_dt,
-            height_scan=self._scan(state.base_pos_w.float(), quat) if self._scan else None,
+            **self._around(state.base_pos_w.float(), quat, foot_pos[..., :2], self.command.value),
         )
 
     def _frame(self, s: Snapshot, *, advance: bool = False) -> tuple[Tensor, Tensor | None]:

@@ -179,7 +179,7 @@ class StepTerms:
         observation_size: O.
         policy_size: columns that are the policy's.
         frames: noise and history of the observation.
-        read: fields of the Snapshot that are computed only because an observation reads them.
+        read: fields of the Snapshot that are computed only because an observation or a reward reads them.
     """
 
     def __init__(
@@ -226,7 +226,7 @@ class StepTerms:
             for group in ("observation", "critic")
         )
         self.observed = (*task.observation, *self.privileged)
-        self.read = {name for t in self.observed for name in t.entry.traits.get("reads", ())}
+        self.read = {name for t in (*self.rewards, *self.observed) for name in t.entry.traits.get("reads", ())}
         widths = [width(t) for t in self.observed]
         self.observation_size, self.policy_size = sum(widths), sum(widths[: len(task.observation)])
         self.frames = Frames(self.observed, setup)
