@@ -19,10 +19,11 @@ from omegaconf import OmegaConf
 
 from go1exp.base.paths import data_root
 from go1exp.cli import EVERY, ONE_BLAS_THREAD, SUBVERBS, VERBS, _by_name, main
-from go1exp.cli.app import parse
+from go1exp.cli.app import begin, parse
 from go1exp.cli.deploy import DeploySettings
 from go1exp.cli.helptext import leaves
 from go1exp.cli.hydra_main import choices_from_files
+from go1exp.cli.play import APP as PLAY
 from go1exp.cli.subjects import ROBOT_GROUPS
 from go1exp.cli.verbs import parted
 from go1exp.config.compose import compose
@@ -647,6 +648,15 @@ def test_play_writes_a_clip_and_a_picture(run: Path, tmp_path: Path) -> None:
     assert 4 <= len(frames) <= 5
     assert iio.imread(tmp_path / "clip.png").std() > 1.0
     assert {p.name for p in tmp_path.iterdir()} == {"clip.mp4", "clip.png"}
+
+
+def test_a_clip_that_cannot_be_written_names_the_package_and_a_format_that_can(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    settings = compose("play", ["policy=clock", "viewer=clip", f"out={tmp_path / 'clip.mp4'}"])
+    with pytest.raises(ConfigError, match=r"an \.mp4 needs .* 'go1exp\[video\]', or name a GIF: out=.*clip\.gif"):
+        PLAY.task(begin("play", settings))
 
 
 def test_a_folder_that_looks_like_a_setting_is_one_if_its_name_can_be_no_key(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
 import warnings
 from pathlib import Path
 
@@ -54,6 +55,13 @@ def test_the_second_of_one_device_and_an_engine_that_is_not_installed_are_refuse
     engine, device = caught.value.problems
     assert "pip install 'go1exp[gpu]'" in engine
     assert device == "device = 'cuda:1': torch finds 1 CUDA devices, numbered from 0"
+
+
+def test_videos_without_their_writer_are_refused_before_a_training(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    preflight.check(config())  # has no videos
+    with pytest.raises(ConfigError, match=r"video.every = 5: .* pip install 'go1exp\[video\]'"):
+        preflight.check(config("video.every=5"))
 
 
 # ---------------------------------------------------------------------- memory

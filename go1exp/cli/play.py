@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from go1exp.base import memory
+from go1exp.base.files import missing_for_mp4
 from go1exp.cli import subjects
 from go1exp.cli.app import App, parse, spinner
 from go1exp.cli.evaluate import writable_file
@@ -102,6 +103,9 @@ def _show(
     count = round(settings.seconds * settings.fps)
     if count < 1:
         raise ConfigError([f"seconds = {settings.seconds:g}: shorter than a picture at fps = {settings.fps}"])
+    gif = out.suffix.lower() == ".gif"
+    if not gif and (missing := missing_for_mp4()):
+        raise ConfigError([f"out = {str(out)!r}: {missing}, or name a GIF: out={out.with_suffix('.gif')}"])
     core.command.value[:] = core.command.value.new_tensor(settings.velocity)
     try:
         frames = video.record(core, policy, settings.seconds, fps=settings.fps, on_frame=progress, footfalls=True)
@@ -109,7 +113,6 @@ def _show(
         video.picture(core, policy, settings.seconds, out.with_suffix(".png"))
         print(f"{error}\nA stick figure instead: {out.with_suffix('.png')}")
         return
-    gif = out.suffix.lower() == ".gif"
     # an .mp4 is written picture by picture
     if gif and (wrong := memory.too_long(settings.seconds, settings.fps * video.GIF_BYTES)):
         raise ConfigError([f"seconds = {settings.seconds:g}: a GIF {wrong}; an .mp4 of any length does"])

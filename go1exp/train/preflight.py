@@ -11,6 +11,7 @@ import torch
 
 from go1exp import robot
 from go1exp.base import memory
+from go1exp.base.files import missing_for_mp4
 from go1exp.config.schema.physics import PhysxBackend, WarpBackend
 from go1exp.config.schema.registry import ConfigError
 from go1exp.mdp.commands import AXES
@@ -91,7 +92,7 @@ def check_shares(config: TrainConfig) -> None:
 
 
 def check_devices(config: TrainConfig) -> None:
-    """Refuse devices and engines that are not there (SB3 would quietly take another).
+    """Refuse devices, engines and a video writer that are not there (SB3 would quietly take another device).
 
     Raises:
         ConfigError: naming each.
@@ -108,6 +109,8 @@ def check_devices(config: TrainConfig) -> None:
         wanted.append(("backend.device", backend.device, "backend=cpu"))
     if isinstance(backend, PhysxBackend):
         problems.append("backend = 'physx': evaluates policies and trains none; use backend=cpu or backend=warp")
+    if config.video.every and (lacking := missing_for_mp4()):
+        problems.append(f"video.every = {config.video.every}: {lacking}, or set it to 0")
     for key, name, instead in wanted:
         if name.startswith("cuda") and not torch.cuda.is_available():
             problems.append(f"{key} = {name!r}: torch finds no CUDA device; use {instead}")
