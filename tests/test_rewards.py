@@ -245,6 +245,12 @@ CASES = [
     Case("foot_clearance", "other parameters", HIGH_FEET, 0.81873075, WIDE),
     Case("action_smoothness", "no change", {"action": [0.7] * 12, "previous_action": [0.7] * 12}, 0.0),
     Case("action_smoothness", "all by 0.25", {"action": [0.5] * 12, "previous_action": [0.25] * 12}, 0.86602540),
+    Case("action_rate", "no change", {"action": [0.7] * 12, "previous_action": [0.7] * 12}, 0.0),
+    Case("action_rate", "all by 0.25", {"action": [0.5] * 12, "previous_action": [0.25] * 12}, 0.75),
+    Case("action_rate", "downward, by 0.05 more than is free", {"previous_action": [0.25] * 12}, 0.03, {"free": 0.2}),
+    Case(
+        "action_rate", "less than is free", {"action": [0.5] * 12, "previous_action": [0.25] * 12}, 0.0, {"free": 0.3}
+    ),
     # Mean 0.25, squared deviations 0.0225 + 0.0025 + 0.0025 + 0.0225, over 3.
     Case("air_time_variance", "unequal swings", {"foot_last_air_time": [0.1, 0.2, 0.3, 0.4]}, 0.05 / 3),
     Case("air_time_variance", "unequal stances", {"foot_last_contact_time": [0.4, 0.1, 0.3, 0.2]}, 0.05 / 3),

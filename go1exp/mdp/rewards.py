@@ -119,12 +119,7 @@ def foot_clock(s: Snapshot, *, rate: Positive = 2.5, height: Positive = 0.06, ex
 
 @reward("foot_clock_ahead", reads=("foot_rise",))
 def foot_clock_ahead(
-    s: Snapshot,
-    *,
-    rate: Positive = 2.5,
-    height: Positive = 0.06,
-    excess: Fraction = 1.0,
-    margin: NonNegative = 0.05,
+    s: Snapshot, *, rate: Positive = 2.5, height: Positive = 0.06, excess: Fraction = 1.0, margin: NonNegative = 0.05
 ) -> Tensor:
     """As ``foot_clock``, with feet that clear what lies ahead: ``height`` or rise + ``margin``, whichever is more.
 
@@ -187,6 +182,12 @@ def foot_clearance(
 def action_smoothness(s: Snapshot) -> Tensor:
     """Change of the policy's output, |a_t - a_t-1|, unscaled actions. Table III."""
     return (s.action - s.previous_action).norm(dim=-1)
+
+
+@reward("action_rate")
+def action_rate(s: Snapshot, *, free: NonNegative = 0.0) -> Tensor:
+    """Actions that jump: sum_j max(|a_t - a_t-1|_j - free, 0)^2 of unscaled actions; with 0 that of legged_gym."""
+    return ((s.action - s.previous_action).abs() - free).clamp(min=0.0).square().sum(-1)
 
 
 @reward("air_time_variance")
