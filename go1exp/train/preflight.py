@@ -109,8 +109,8 @@ def check_devices(config: TrainConfig) -> None:
         wanted.append(("backend.device", backend.device, "backend=cpu"))
     if isinstance(backend, PhysxBackend):
         problems.append("backend = 'physx': evaluates policies and trains none; use backend=cpu or backend=warp")
-    if config.video.every and (lacking := missing_for_mp4()):
-        problems.append(f"video.every = {config.video.every}: {lacking}, or set it to 0")
+    if config.video.every and (absent := missing_for_mp4()):
+        problems.append(f"video.every = {config.video.every}: {absent}, or set it to 0")
     for key, name, instead in wanted:
         if name.startswith("cuda") and not torch.cuda.is_available():
             problems.append(f"{key} = {name!r}: torch finds no CUDA device; use {instead}")
