@@ -7,7 +7,6 @@ the package, for the robot's computer uses it too.
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import json
 import os
 import secrets
@@ -87,10 +86,3 @@ def _beside(final: Path, keep_suffix: bool) -> Path:
     """Return a name of its own for every writer: two that write one file at a time do not mix."""
     name = f"{final.name}.{secrets.token_hex(4)}{PARTIAL}"
     return final.with_name(name + final.suffix if keep_suffix else name)
-
-
-def missing_for_mp4() -> str | None:
-    """Return what an .mp4 needs that is not installed, None if nothing is."""
-    if importlib.util.find_spec("imageio_ffmpeg") is not None:
-        return None
-    return "an .mp4 needs the package imageio-ffmpeg: pip install 'go1exp[video]'"

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from go1exp.base import memory
-from go1exp.base.files import missing_for_mp4
 from go1exp.cli import subjects
 from go1exp.cli.app import App, parse, spinner
 from go1exp.cli.evaluate import writable_file
@@ -95,7 +94,7 @@ def _show(
 ) -> None:
     """Write clip and picture, with their ``progress``, or open the live viewer without one."""
     from go1exp.evaluate import video
-    from go1exp.sim.env.camera import RenderingUnavailable
+    from go1exp.sim.env.camera import RenderingUnavailable, missing_for_mp4
 
     if progress is None:
         video.live(core, policy)

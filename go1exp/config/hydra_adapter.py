@@ -353,7 +353,7 @@ def _culprit(verb: str, overrides: Sequence[str], folders: tuple[Path, ...]) -> 
             if o.is_add() and exists:
                 return Refusal("present", o.key_or_group)
             if (o.is_delete() and not exists) or isinstance(error.__cause__, AttributeError | KeyError):
-                return Refusal("key", (exists and str(getattr(error.__cause__, "full_key", ""))) or o.key_or_group)
+                return Refusal("key", getattr(error.__cause__ if exists else None, "full_key", None) or o.key_or_group)
             return None
     return None
 

@@ -337,7 +337,7 @@ def make_logger(config: LoggerConfig, run: Path, iteration: int, settings: dict[
             if settings and not steps:
                 writers[-1].write({"hparams": _hparams(settings)}, {"hparams": ()}, 0)
         except AssertionError:
-            print("metrics go to the other writers: no tensorboard is installed (pip install 'go1exp[tensorboard]')")
+            print("tensorboard is not installed (pip install 'go1exp[tensorboard]'): metrics go to the other writers")
     if config.csv:
         writers.append(CsvWriter(run, iteration))
     if config.wandb is not None:

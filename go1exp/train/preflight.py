@@ -11,13 +11,13 @@ import torch
 
 from go1exp import robot
 from go1exp.base import memory
-from go1exp.base.files import missing_for_mp4
 from go1exp.config.schema.physics import PhysxBackend, WarpBackend
 from go1exp.config.schema.registry import ConfigError
 from go1exp.mdp.commands import AXES
 from go1exp.mdp.curricula import YAW_ARM
 from go1exp.sim.effects.rules import nested_actuators
 from go1exp.sim.env.batch import FLOAT_BYTES, robot_bytes
+from go1exp.sim.env.camera import missing_for_mp4
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.engine import device_of, free_on
 from go1exp.sim.task import TrainConfig

@@ -10,6 +10,7 @@ from __future__ import annotations
 import atexit
 import functools
 import importlib
+import importlib.util
 import math
 import os
 import subprocess
@@ -77,6 +78,13 @@ os._exit(0)
 
 class RenderingUnavailable(Expected):
     """There is no GL library to draw with; the message says what to install or set."""
+
+
+def missing_for_mp4() -> str | None:
+    """Return what an .mp4 needs that is not installed, None if nothing is."""
+    if importlib.util.find_spec("imageio_ffmpeg") is not None:
+        return None
+    return "an .mp4 needs the package imageio-ffmpeg: pip install 'go1exp[video]'"
 
 
 @functools.cache
