@@ -348,6 +348,14 @@ def test_actions_are_cut_and_scaled_to_joint_targets_about_the_nominal_stance(st
     assert not s.action.any()
 
 
+def test_no_target_changes_by_more_than_the_largest_step(start_core: Make) -> None:
+    core = start_core(*QUIET, "action.scale=0.25", "action.max_step=0.1", num_envs=1, noise=False)
+    for wanted, reached in ((1.0, 0.1), (1.0, 0.2), (0.7, 0.175), (-3.0, 0.075)):
+        result = core.step(torch.full((1, 12), wanted))
+        np.testing.assert_allclose(core.snapshot().joint_target[0], robot.NOMINAL_STANCE + reached, atol=1e-6)
+        np.testing.assert_allclose(result.observation[0, 36:48], reached / 0.25, atol=1e-6)
+
+
 def only(name: str, function: Callable[..., Tensor], weight: float = 1.0) -> Term:
     """A reward term that is not in the registry."""
     return Term(name, Entry("reward", name, function), {}, {"weight": weight})

@@ -228,6 +228,25 @@ def test_at_another_rate_the_previous_action_is_the_mean_over_a_training_period(
         assert inputs == pytest.approx([sum(given[k : k + cycles]) / cycles for k in range(len(inputs))], abs=1e-6)
 
 
+@pytest.mark.parametrize(("policy_dt", "cycles"), [(None, 1), (0.01, 2), (0.004, 5)])
+def test_the_step_of_a_target_is_bounded_from_the_previous_action_at_any_rate(
+    task: TaskConfig, policy_dt: float | None, cycles: int
+) -> None:
+    where, observed = columns(task, "previous_action"), []
+    task = dataclasses.replace(task, action=dataclasses.replace(task.action, max_step=0.1 * task.action.scale))
+
+    def policy(observation: torch.Tensor) -> torch.Tensor:
+        observed.append(float(observation[0, where].mean()))
+        return torch.full((len(observation), 12), 0.25)
+
+    evaluate(task, policy, settings(seconds=0.2, settle_s=0.0, policy_dt=policy_dt))
+    actions, means = [0.0] * cycles, [0.0]
+    for _ in observed:
+        actions.append(min(0.25, means[-1] + 0.1))
+        means.append(sum(actions[-cycles:]) / cycles)
+    assert observed == pytest.approx(means[: len(observed)], abs=1e-6)
+
+
 def test_the_same_seed_gives_the_same_report_which_says_under_what_it_was_made(task: TaskConfig) -> None:
     config = settings(randomize=True, push=True, noise=True, seconds=0.4, settle_s=0.0, seed=7)
     policy: Policy = lambda observation: 0.3 * observation[:, :12]  # noqa: E731

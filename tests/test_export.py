@@ -110,9 +110,11 @@ def scattered(core: Go1Core) -> Tensor:
     return core.terms.frames.begun(*core._frame(core.snapshot()), torch.ones(n, dtype=torch.bool))
 
 
-@pytest.mark.parametrize("choice", OBSERVATIONS)
-def test_torch_onnx_and_the_environment_agree(choice: str, make_task: Callable[..., TaskConfig]) -> None:
-    task = make_task("backend.threads=1", f"observation={choice}", "action.clip=2.0")
+@pytest.mark.parametrize(
+    ("choice", "max_step"), [*((choice, "null") for choice in OBSERVATIONS), (OBSERVATIONS[0], "0.1")]
+)
+def test_torch_onnx_and_the_environment_agree(choice: str, max_step: str, make_task: Callable[..., TaskConfig]) -> None:
+    task = make_task("backend.threads=1", f"observation={choice}", "action.clip=2.0", f"action.max_step={max_step}")
     policy = network(sum(width(t) for t in task.observation))
     module = DeployedPolicy(policy, task.observation, task.action)
     session = OnnxPolicy(to_onnx(module), module.inputs, module.outputs)
@@ -129,6 +131,9 @@ def test_torch_onnx_and_the_environment_agree(choice: str, make_task: Callable[.
         wanted = policy._predict(observed, deterministic=True).detach()
         core.step(wanted)
         action = wanted.clamp(-2.0, 2.0)
+        if task.action.max_step is not None:
+            step, before = task.action.max_step / task.action.scale, given["previous_action"]
+            action = torch.minimum(torch.maximum(action, before - step), before + step)
         target = torch.as_tensor(robot.NOMINAL_STANCE, dtype=torch.float32) + task.action.scale * action
         expected = {"joint_target": target, "observation": observed, "action": action}
         kept = core.steps > 0  # the others have fallen, and stand again

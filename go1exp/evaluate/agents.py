@@ -22,6 +22,7 @@ from go1exp.deploy.sim_robot.machine import noisy
 from go1exp.evaluate.controller.batch import Driven
 from go1exp.evaluate.controller.types import Controller, TrunkVelocity
 from go1exp.logs.record.simulate import sample
+from go1exp.mdp.derived import limited
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TaskConfig
 from go1exp.train.policy import Policy
@@ -142,7 +143,7 @@ class PolicyAgent(Agent):
 
 class _RunningPolicy:
     def __init__(self, agent: PolicyAgent, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> None:
-        self._policy, self._core = agent.policy, core
+        self._policy, self._limits = agent.policy, agent.task.action.limits
         self._filter = estimator(core, trunk_velocity, seed)
         # A policy that runs faster than it was trained: its mean action and its frames of a training period (``Past``).
         periods = agent.task.sim.policy_dt, core.task.sim.policy_dt
@@ -161,8 +162,10 @@ class _RunningPolicy:
         history = self._history
         observation[:, history.earlier] = observation[:, history.newest] if self._earlier is None else self._earlier
         action = self._policy(observation)
-        clip = self._core.task.action.clip
-        self._previous = self._actions.mean(action.clamp(-clip, clip))
+        if self._actions.cycles > 1:  # else the environment limits it
+            before = torch.zeros_like(action) if self._previous is None else self._previous
+            action = limited(action, before, *self._limits)
+            self._previous = self._actions.mean(action)
         self._earlier = self._frames.after(observation[:, history.carried], observation[:, history.earlier])
         return action
 

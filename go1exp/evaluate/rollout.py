@@ -61,6 +61,8 @@ def evaluation_task(task: TaskConfig, config: EvalConfig) -> TaskConfig:
     fixed = Term("command", members("command")["fixed_velocity"], {})
     engine = config.engine or task.backend.as_reference()
     changes: dict[str, Any] = {"sim": sim, "command": fixed, "curriculum": (), "backend": engine}
+    if period < task.sim.policy_dt:  # agents bound the change over a period of training, which is several steps
+        changes["action"] = dataclasses.replace(task.action, max_step=None)
     if not config.randomize:
         changes["rand"] = ()
         changes["effect"] = tuple(dataclasses.replace(e, slots={**e.slots, "spread": {}}) for e in task.effect)

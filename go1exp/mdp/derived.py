@@ -66,9 +66,17 @@ def clock_angle(s: Snapshot, rate: float) -> Tensor:
     return 2.0 * math.pi * (rate * s.episode_time).frac()
 
 
-def clipped(action: Tensor, clip: float) -> Tensor:
-    """Cut a policy's output (N, 12) at +-``clip``: the action in force, which the policy observes as its last one."""
-    return action.clamp(-clip, clip)
+def limited(action: Tensor, previous: Tensor, clip: float, step: float | None) -> Tensor:
+    """Return the action in force (N, 12), which the policy observes as its last one, for a policy's output.
+
+    Args:
+        action: the output.
+        previous: the action in force before.
+        clip: bound of an action.
+        step: bound of its change; None for none.
+    """
+    action = action.clamp(-clip, clip)
+    return action if step is None else previous + (action - previous).clamp(-step, step)
 
 
 def of_shape(action: Tensor, shape: tuple[int, ...]) -> Tensor:
@@ -81,5 +89,5 @@ def of_shape(action: Tensor, shape: tuple[int, ...]) -> Tensor:
 
 
 def joint_target(action: Tensor, nominal: Tensor, scale: float) -> Tensor:
-    """Return position targets (N, 12), rad: nominal stance (12,) + ``scale`` (rad) x clipped action (N, 12)."""
+    """Return position targets (N, 12), rad: nominal stance (12,) + ``scale`` (rad) x action in force (N, 12)."""
     return nominal + scale * action

@@ -79,10 +79,17 @@ class ActionConfig(Strict):
     Attributes:
         scale: rad per unit of action.
         clip: bound of the policy's output.
+        max_step: largest change of a target from one policy step to the next, rad; null for any.
     """
 
     scale: Positive
     clip: Positive
+    max_step: Positive | None = None  # runs of older versions have none
+
+    @property
+    def limits(self) -> tuple[float, float | None]:
+        """Bounds of an action and of its change, as ``limited`` takes them."""
+        return self.clip, None if self.max_step is None else self.max_step / self.scale
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from go1exp.base.tensors.rotation import projected_gravity
 from go1exp.config.schema.history import frame_width, frames_of, width
 from go1exp.config.schema.registry import Expected, Term
 from go1exp.deploy.runtime.metadata import Block, Port
-from go1exp.mdp.derived import clipped, joint_target
+from go1exp.mdp.derived import joint_target, limited
 from go1exp.mdp.types import Snapshot
 from go1exp.sim.task import ActionConfig
 
@@ -66,6 +66,9 @@ SOURCES = {
 }
 """Field of the Snapshot -> the reading that it is computed from. The robot does not measure the other fields."""
 
+PREVIOUS = "previous_action"
+"""Reading that the change of an action is bounded from."""
+
 LAWS: dict[str, Callable[[Tensor], Tensor]] = {
     "projected_gravity_b": projected_gravity,
     "episode_time": lambda reading: reading.squeeze(-1),
@@ -75,7 +78,7 @@ LAWS: dict[str, Callable[[Tensor], Tensor]] = {
 OUTPUTS = (
     Port("joint_target", J, "rad", "joint", "position targets for the motors"),
     Port("observation", 0, "as each term", "-", "input of the network: the concatenated terms"),
-    Port("action", J, "1", "joint", "the network's output, clipped; `previous_action` is its recent mean"),
+    Port("action", J, "1", "joint", "the network's output, limited; `previous_action` is its recent mean"),
 )
 """Outputs of the graph; the observation's size is the policy's."""
 
@@ -124,13 +127,13 @@ def blocks(terms: Sequence[Term]) -> tuple[Block, ...]:
     return tuple(placed)
 
 
-def required_inputs(terms: Sequence[Term]) -> tuple[Port, ...]:
-    """Return the readings that the terms need, in the order of ``READINGS``.
+def required_inputs(terms: Sequence[Term], action: ActionConfig | None = None) -> tuple[Port, ...]:
+    """Return the readings that the terms, and the bound of ``action``'s change, need, in the order of ``READINGS``.
 
     Raises:
         ExportError: if a term reads what the robot does not measure, or remembers the past.
     """
-    read: set[str] = set()
+    read: set[str] = set() if action is None or action.max_step is None else {PREVIOUS}
     for term in terms:
         if term.entry.remembers:
             raise ExportError(
@@ -151,13 +154,13 @@ class Observing(nn.Module):
         size: of the flat observation.
     """
 
-    def __init__(self, terms: Sequence[Term]) -> None:
-        """Take the terms; raise ExportError if one reads what the robot does not measure."""
+    def __init__(self, terms: Sequence[Term], action: ActionConfig | None = None) -> None:
+        """Take terms and limits of actions; raise ExportError if a term reads what the robot does not measure."""
         super().__init__()
         self._terms = tuple(terms)
         self._earlier = [width(term) - frame_width(term) for term in terms]
         past = (dataclasses.replace(PAST, size=sum(self._earlier)),) if any(self._earlier) else ()
-        self.inputs = (*required_inputs(terms), *past)
+        self.inputs = (*required_inputs(terms, action), *past)
         self.size = sum(map(width, terms))
 
     def _named(self, readings: Sequence[Tensor]) -> dict[str, Tensor]:
@@ -191,17 +194,18 @@ class DeployedPolicy(Observing):
         Raises:
             ExportError: if a term reads what the robot does not measure.
         """
-        super().__init__(terms)
+        super().__init__(terms, action)
         self.outputs, self._action = outputs(self.size), action
         self.actor, self.head = network.mlp_extractor.policy_net, network.action_net
         self.register_buffer("nominal", torch.as_tensor(robot.NOMINAL_STANCE, dtype=torch.float32))
         self.eval()
 
     def forward(self, *readings: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return joint targets (N, 12), observation (N, O) and clipped action (N, 12) for readings (N, size)."""
+        """Return joint targets (N, 12), observation (N, O) and action in force (N, 12) for readings (N, size)."""
         given = self._named(readings)
         observation = self._flat([computed(term, given) for term in self._terms], given)
-        action = clipped(self.head(self.actor(observation)), self._action.clip)
+        previous = given.get(PREVIOUS, observation)  # none is needed where no change is bounded
+        action = limited(self.head(self.actor(observation)), previous, *self._action.limits)
         return joint_target(action, self.nominal, self._action.scale), observation, action
 
 

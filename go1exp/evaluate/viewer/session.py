@@ -21,7 +21,6 @@ from go1exp.evaluate.protocol.plan import Impulses, Kicker, heading
 from go1exp.evaluate.rollout import planar_velocity, require_agreement
 from go1exp.evaluate.viewer import requests
 from go1exp.evaluate.viewer.requests import Ground, Setup, task_under
-from go1exp.mdp.derived import clipped
 from go1exp.sim.env.core import Go1Core
 
 Array = NDArray[np.float64]
@@ -177,7 +176,8 @@ class Session:
         core.plant.reset(everyone, old.target.to(core.backend.qpos.dtype))
         action = core.task.action
         nominal = torch.as_tensor(robot.NOMINAL_STANCE, dtype=torch.float32)
-        held = clipped((old.target - nominal) / action.scale, action.clip)
+        held = ((old.target - nominal) / action.scale).clamp(-action.clip, action.clip)
+        core.action.copy_(held)  # it is no change
         self._observation = core.step(held).observation
         if self._estimate is not None:
             self._estimate.restart(0)

@@ -22,7 +22,7 @@ from go1exp.base.tensors.rotation import projected_gravity, rotate_inverse
 from go1exp.config.schema.training import Value
 from go1exp.mdp.commands import UniformVelocity
 from go1exp.mdp.curricula import TrackedPath
-from go1exp.mdp.derived import clipped, joint_target, of_shape
+from go1exp.mdp.derived import joint_target, limited, of_shape
 from go1exp.mdp.feet import Feet
 from go1exp.mdp.ground import GroundHeight, Surroundings
 from go1exp.mdp.kinematics import KinematicState, lift
@@ -266,7 +266,7 @@ class Go1Core:
     def _advance_physics(self, action: Tensor) -> None:
         """Run the substeps of one policy step."""
         self.previous_action.copy_(self.action)
-        self.action.copy_(clipped(of_shape(action, self.action.shape), self.task.action.clip))
+        self.action.copy_(limited(of_shape(action, self.action.shape), self.previous_action, *self.task.action.limits))
         self._last_action.copy_(self.action)
         self.target.copy_(joint_target(self.action, self._nominal, self.task.action.scale))
         target = self.target.to(self.backend.qpos.dtype)
