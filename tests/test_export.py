@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.metadata
 import io
 import json
 import sys
@@ -174,7 +175,7 @@ def test_a_bundle_says_what_its_run_was(run: Path, good: Bundle) -> None:
     about = good.metadata
     assert good.config == run_folder.read_as_written(run)
     assert good.versions["run"] == json.loads((run / "meta.json").read_text())
-    assert good.versions["packages"]["torch"] == torch.__version__
+    assert good.versions["packages"]["torch"] == importlib.metadata.version("torch")
     assert about.joints == robot.JOINTS
     assert about.kp == (25.0, 30.0, 35.0) * 4
     assert about.kd == (0.7,) * 12
