@@ -10,6 +10,7 @@ import tempfile
 import time
 from collections.abc import Callable
 
+import mujoco
 import torch
 
 from go1exp import robot
@@ -60,10 +61,16 @@ def stepped(step: Callable[[torch.Tensor], object], num_envs: int) -> Subject:
     return work
 
 
-def bare_subject(task: TaskConfig, num_envs: int) -> Subject:
-    """MuJoCo Warp alone, as one graph: the same model with its sensors, a PD torque once a policy step, no MDP."""
+def bare_subject(
+    task: TaskConfig, num_envs: int, change: Callable[[mujoco.MjModel], object] = lambda model: None
+) -> Subject:
+    """MuJoCo Warp alone, as one graph: the same model with its sensors, a PD torque once a policy step, no MDP.
+
+    ``change`` may set options of the model.
+    """
     terrain = build_terrain(task.terrain)
     model, sensors = build_model(task.robot, terrain, task.sim.physics_dt, contact=task.contact)
+    change(model)
     backend = make_backend(task.backend, model, sensors, num_envs)
     device = backend.qpos.device
     qpos, qvel = torch.zeros_like(backend.qpos), torch.zeros_like(backend.qvel)
