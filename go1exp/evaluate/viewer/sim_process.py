@@ -201,14 +201,6 @@ class Link(Protocol):
         """Return the next frame if it has arrived, without waiting; raise ``requests.Ended`` after the last one."""
 
 
-@dataclass(frozen=True)
-class Refused:
-    """The robot could not be built: the reasons, and whether they are problems of the settings."""
-
-    lines: tuple[str, ...]
-    settings: bool
-
-
 class RobotProcess:
     """A robot in another process, which listens for its client at ``address``, host and port."""
 
@@ -242,10 +234,10 @@ class RobotProcess:
         try:
             answer = self._pipe.recv()
         except EOFError:
-            answer = Refused(("the simulated robot's process ended before it listened",), settings=False)
-        if isinstance(answer, Refused):
+            answer = Expected("the simulated robot's process ended before it listened")
+        if isinstance(answer, Exception):
             self.close()
-            raise ConfigError(list(answer.lines)) if answer.settings else Expected("\n".join(answer.lines))
+            raise answer
         self.address: tuple[str, int] = answer
         self._requests: list[ask.Request] = []
         self._waiting = False
@@ -297,10 +289,10 @@ def _run(
         body = Body(**required_parts(groups), tile=tile)
         server = Server(Robot(body, config), config, address[1], address[0])
     except ConfigError as error:
-        pipe.send(Refused(tuple(error.problems), settings=True))
+        pipe.send(ConfigError(error.problems))
         return
     except Expected as error:
-        pipe.send(Refused((str(error),), settings=error.status == REFUSED))
+        pipe.send(ConfigError([str(error)]) if error.status == REFUSED else Expected(str(error)))
         return
     pipe.send(server.address)
     answering = Answering(Probe(server, body, config), pipe)
