@@ -13,7 +13,6 @@ from scipy import stats
 
 from go1exp import robot
 from go1exp.config.compose import compose
-from go1exp.evaluate.protocol.base import chosen
 from go1exp.evaluate.protocol.claims import Claim, evaluated, verdict
 from go1exp.evaluate.protocol.ground import COURSE, GOAL, RESOLUTION, RUN_UP, SHAPES, TREAD, UNITS, Lanes
 from go1exp.evaluate.protocol.kinds import energy, gait, hardware, push_map, rate, terrain
@@ -24,6 +23,7 @@ from go1exp.evaluate.statistics.intervals import Interval
 from go1exp.mdp.measures.trace import Trace
 from go1exp.sim.task import parse_train
 from go1exp.sim.terrain import build_terrain
+from tests.test_protocols import selected
 
 STEPS, DT = 100, 0.02
 
@@ -112,9 +112,7 @@ def test_where_half_pass_stays_within_the_ladder() -> None:
 
 def test_the_lag_counts_from_the_instant_of_the_command() -> None:
     """A velocity that follows 0.15 s late, at the ends of the steps at whose starts the commands are given."""
-    protocol: Any = chosen(compose("eval", ["protocol=sinusoid", "protocol.sinusoid.robots=1"])["protocol"])[0][
-        0
-    ].protocol
+    protocol: Any = selected("sinusoid", "robots=1").protocol
     sine, steps = protocol.ladder[3], 1750
     end = (1 + np.arange(steps)) * DT
     command, velocity = sine.at(end - DT)[:, None], sine.at(end - 0.15)[:, None]
