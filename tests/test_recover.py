@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -33,7 +35,7 @@ def test_a_robot_stands_from_the_time_on_from_which_it_holds_for_long_enough() -
 
 
 def test_robots_lie_on_side_and_back_at_rest_with_joints_all_over_their_range(stage: Stage) -> None:
-    protocol = selected("recover", "robots=6").protocol
+    protocol: Any = selected("recover", "robots=6").protocol
     start = np.stack([protocol.lying(stage, n) for n in range(12)])
     joints, stops = start[:, 7:], robot.JOINT_POS_LIMITS
     assert ((joints >= stops[:, 0]) & (joints <= stops[:, 1])).all()

@@ -13,7 +13,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -186,19 +185,8 @@ class Probe:
 
 
 def _kicker(made: Robot) -> Kicker | None:
-    """Return what pushes a robot; None for a suspended one."""
     floats = made.backend.qpos.shape[1] > robot.NUM_JOINTS
     return Kicker(made.backend, TICK, one_push(math.nan, 0.0, 0.0)) if floats else None
-
-
-class Link(Protocol):
-    """Connection of the page to a robot."""
-
-    def send(self, request: ask.Request) -> None:
-        """Send a request of the user."""
-
-    def look(self) -> Frame | None:
-        """Return the next frame if it has arrived, without waiting; raise ``requests.Ended`` after the last one."""
 
 
 class RobotProcess:
@@ -247,7 +235,7 @@ class RobotProcess:
         self._requests.append(request)
 
     def look(self) -> Frame | None:
-        """Return the next frame if it has arrived, and ask for another one; see ``Link``."""
+        """Return the next frame if it has come, and ask for another one; raise ``requests.Ended`` after the last one."""
         try:
             frame: Frame | None = None
             if self._waiting and self._pipe.poll():
