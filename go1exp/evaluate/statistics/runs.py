@@ -197,7 +197,6 @@ def _p_of_ranks(ranks: tuple[tuple[float, ...], ...]) -> float:
 
 
 def _mean_difference(*ranks: NDArray[np.float64], axis: int = -1) -> NDArray[np.float64]:
-    """Return the mean of the first sample, minus that of a second one."""
     first = ranks[0].mean(axis=axis)
     return np.asarray(first - ranks[1].mean(axis=axis) if len(ranks) > 1 else first)
 

@@ -157,7 +157,6 @@ class Session:
         self.core.command.value[:] = self.core.command.value.new_tensor(self.command)
 
     def _fresh(self) -> None:
-        """Clear the state of the last episode."""
         self._since = 0.0
         if self._estimate is not None:
             self._estimate.restart(0)
