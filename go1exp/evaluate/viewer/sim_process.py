@@ -235,7 +235,7 @@ class RobotProcess:
         self._requests.append(request)
 
     def look(self) -> Frame | None:
-        """Return the next frame if it has come, and ask for another one; raise ``requests.Ended`` after the last one."""
+        """Return the next frame if it has come, and ask for another; raise ``requests.Ended`` after the last one."""
         try:
             frame: Frame | None = None
             if self._waiting and self._pipe.poll():
