@@ -213,26 +213,19 @@ def stage(agent: Agent, **changes: Any) -> Stage:
     return Stage(agent, Setting(**{"noise": True, "randomize": True, "trunk_velocity": "exact", "seed": 1, **changes}))
 
 
-class Listening:
-    """A policy that keeps the command that it sees."""
+def test_a_command_is_seen_in_the_step_that_it_is_for(stands: PolicyAgent) -> None:
+    observations: list[Tensor] = []
 
-    def __init__(self) -> None:
-        self.seen: list[Tensor] = []
+    def listens(observation: Tensor) -> Tensor:
+        observations.append(observation.clone())
+        return stands.policy(observation)
 
-    def __call__(self, observation: Tensor) -> Tensor:
-        self.seen.append(observation.clone())
-        return torch.zeros(len(observation), 12)
-
-
-def test_a_command_is_seen_in_the_step_that_it_is_for(make_task: Callable[..., TaskConfig]) -> None:
-    policy = Listening()
-    task = make_task("backend.threads=1", "sim.physics_dt=0.005")
     command = np.zeros((6, 1, 3))
     command[:, 0, 0] = np.arange(6) * 0.1
-    quiet = stage(PolicyAgent("listens", task, policy), noise=False, randomize=False)
+    quiet = stage(dataclasses.replace(stands, policy=listens), noise=False, randomize=False)
     motion = quiet.run(Plan(command))
     np.testing.assert_allclose(motion.command[:, 0, 0], command[:, 0, 0], atol=1e-7)
-    seen = torch.cat(policy.seen).numpy()
+    seen = torch.cat(observations).numpy()
     column = [c for c in range(seen.shape[1]) if np.allclose(seen[:, c], command[:, 0, 0], atol=1e-6)]
     assert len(column) == 1
 
