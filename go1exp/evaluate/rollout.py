@@ -286,9 +286,7 @@ def delay_margin(
     of each delay that was run in what is returned; ``ms`` is None if robots fall without any.
     """
     runs, margin = {"0": falls}, None if falls["count"] else 0
-    for ms in DELAYS_MS:
-        if margin is None or runs[str(margin)]["count"]:
-            break
+    for ms in () if margin is None else DELAYS_MS:
         late = delayed(task, 1e-3 * ms)
         runs[str(ms)] = evaluate(late, policy, config, on_step, controller=controller)["distinct_falls"]
         if runs[str(ms)]["count"]:
