@@ -8,7 +8,7 @@ from copy import deepcopy
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -22,6 +22,10 @@ from go1exp.sim.actuator.actuator_net import ActuatorNet, NetInfo, Provenance, g
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TaskConfig, parse_task
 from tests.small_run import made_once, plain, trained
+
+if TYPE_CHECKING:
+    from go1exp.evaluate.agents import PolicyAgent
+    from go1exp.evaluate.protocol.stage import Stage
 
 torch.set_num_threads(1)
 
@@ -70,6 +74,23 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> str:
         path.write_bytes(build(run, seconds=0.2))
 
     return str(made_once(tmp_path_factory, "walk.zip", make))
+
+
+@pytest.fixture(scope="session")
+def stands(make_task: Callable[..., TaskConfig]) -> PolicyAgent:
+    """Nominal robots that hold their stance."""
+    from go1exp.evaluate.agents import PolicyAgent
+
+    task = make_task("backend.threads=1", "sim.physics_dt=0.005", "rand=none")
+    return PolicyAgent("stands", task, lambda observation: torch.zeros(len(observation), 12))
+
+
+@pytest.fixture(scope="session")
+def stage(stands: PolicyAgent) -> Stage:
+    """They are to play something, without noise."""
+    from go1exp.evaluate.protocol.stage import Setting, Stage
+
+    return Stage(stands, Setting(noise=False, randomize=False, trunk_velocity="exact", seed=1))
 
 
 @pytest.fixture

@@ -98,12 +98,6 @@ def best_of(run: Path) -> tuple[int, int, float]:
     return (run / "best.pt").read_bytes()[0], row["iteration"], row["score"]
 
 
-def test_the_best_policy_is_that_of_the_lowest_score(tmp_path: Path) -> None:
-    evaluated_run(tmp_path, {1: 0.5, 2: 0.3, 3: 0.4})
-    assert best_of(tmp_path) == (2, 2, 0.3)
-    assert [r["score"] for r in rows(tmp_path / "evals.csv")] == [0.5, 0.3, 0.4]
-
-
 @pytest.mark.parametrize("policies", [True, False])
 def test_a_best_policy_of_later_iterations_gives_way_when_a_run_goes_on_before_it(
     tmp_path: Path, policies: bool

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import torch
 
-import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
 from go1exp.base import memory
 from go1exp.cli.app import begin
 from go1exp.cli.play import APP as PLAY
@@ -22,13 +21,14 @@ from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError, TooLongError, members
 from go1exp.evaluate import video
 from go1exp.evaluate.agents import PolicyAgent
-from go1exp.evaluate.protocol.base import Chosen, chosen
+from go1exp.evaluate.protocol.base import chosen
 from go1exp.evaluate.protocol.plan import STEP_BYTES, Plan
 from go1exp.evaluate.protocol.playing import refuse
 from go1exp.evaluate.protocol.stage import Setting, Stage
 from go1exp.evaluate.report import evaluating
 from go1exp.logs.record.plan import ROW_BYTES
 from go1exp.sim.task import TaskConfig, parse_train
+from tests.test_protocols import selected
 
 # ---------------------------------------------------------------------- go1exp play
 
@@ -85,13 +85,6 @@ def stage(make_task: Callable[..., TaskConfig]) -> Stage:
     return Stage(agent, Setting(noise=False, randomize=False, trunk_velocity="exact", seed=0))
 
 
-def one(name: str, *overrides: str) -> Chosen:
-    """A protocol of conf/protocol with some settings changed."""
-    changed = [f"++protocol.{name}.{o}" for o in overrides]
-    (selected,), _ = chosen(compose("eval", [f"protocol={name}", *changed])["protocol"])
-    return selected
-
-
 @pytest.mark.parametrize(
     ("name", "key", "value", "unit"),
     [
@@ -121,7 +114,7 @@ def test_a_protocol_that_does_not_fit_is_refused_by_its_key_with_what_fits(
     whole, falling = key == "robots", key == "speeds"
     wrong = "1000000000" if whole else "1e-9" if falling else "1e9"
     with pytest.raises(TooLongError) as caught:
-        refuse(one(name, f"{key}={value.format(wrong)}"), stage)
+        refuse(selected(name, f"{key}={value.format(wrong)}"), stage)
     (problem,) = caught.value.problems
     offered = re.fullmatch(
         rf"protocol\.{name}\.{key} = \S+: to play \S+ s with \d+ robots takes at least \S+ GB,"
@@ -132,9 +125,9 @@ def test_a_protocol_that_does_not_fit_is_refused_by_its_key_with_what_fits(
     number = float(offered[1])
     beyond = number * (0.95 if falling else 1.05)
     given = (str(round(number)), str(round(beyond) + 1)) if whole else (f"{number!r}", f"{beyond!r}")
-    refuse(one(name, f"{key}={value.format(given[0])}"), stage)
+    refuse(selected(name, f"{key}={value.format(given[0])}"), stage)
     with pytest.raises(TooLongError, match=rf"protocol\.{name}\."):  # by another key where that can mend it as well
-        refuse(one(name, f"{key}={value.format(given[1])}"), stage)
+        refuse(selected(name, f"{key}={value.format(given[1])}"), stage)
 
 
 def test_where_no_setting_alone_can_mend_it_all_are_named(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -143,9 +136,9 @@ def test_where_no_setting_alone_can_mend_it_all_are_named(stage: Stage, monkeypa
         r"protocol\.kicks: first_s = 1e\+09, every_s = 1e\+09, jitter_s = 0\.4, robots = 200: .* s at most would fit"
     )
     with pytest.raises(TooLongError, match=words):
-        refuse(one("kicks", "first_s=1e9", "every_s=1e9"), stage)
+        refuse(selected("kicks", "first_s=1e9", "every_s=1e9"), stage)
     monkeypatch.setattr(memory, "free", lambda: None)
-    refuse(one("kicks", "first_s=1e9"), stage)
+    refuse(selected("kicks", "first_s=1e9"), stage)
 
 
 @pytest.mark.parametrize("measures", ["[]", "[stride_rate]"])
@@ -165,7 +158,7 @@ def test_a_protocol_plays_the_lengths_that_it_says(
         raise Seen
 
     monkeypatch.setattr(Stage, "session", seen)
-    protocol = one(name, f"measures={measures}").protocol
+    protocol = selected(name, f"measures={measures}").protocol
     with pytest.raises(Seen):
         protocol.play(stage)
     length, (plan,) = protocol.lengths()[0], plans
@@ -220,7 +213,7 @@ def test_a_report_asks_no_run_for_what_does_not_fit(
     with pytest.raises(TooLongError, match=r"^evaluation\.seconds = "):
         evaluating.evaluate_missing([(run, None)], settings, show)
     with pytest.raises(TooLongError, match=r"^seconds = "):
-        evaluating.evaluate_missing([(run, one("gait"))], settings, show)
+        evaluating.evaluate_missing([(run, selected("gait"))], settings, show)
 
 
 # ---------------------------------------------------------------------- too short, or without end
@@ -238,19 +231,19 @@ def test_a_report_asks_no_run_for_what_does_not_fit(
 def test_a_protocol_without_a_step_that_counts_is_refused(name: str, overrides: tuple[str, ...], stage: Stage) -> None:
     words = rf"^protocol\.{name}\.seconds = 0\.\d+: of these 0\.\d+ s no step of the policy \(0\.0\d s\) is left"
     with pytest.raises(ConfigError, match=words):
-        refuse(one(name, *overrides), stage)
+        refuse(selected(name, *overrides), stage)
 
 
 @pytest.mark.parametrize(("name", "rest"), [("kicks", "every_s"), ("push_map", "watch_s")])
 def test_a_push_that_outlasts_its_time_is_refused(name: str, rest: str) -> None:
     """Its steps would not fit into memory, and the next kick would begin within it."""
     with pytest.raises(ConfigError, match=rf"^protocol\.{name}\.push_s = 1000000000\.0: must be at most {rest} = "):
-        one(name, "push_s=1e9")
+        selected(name, "push_s=1e9")
 
 
 def test_a_length_beyond_all_numbers_is_refused_too(stage: Stage) -> None:
     with pytest.raises(TooLongError, match="takes at least inf GB"):
-        refuse(one("kicks", "first_s=1e308", "every_s=1e308"), stage)
+        refuse(selected("kicks", "first_s=1e308", "every_s=1e308"), stage)
 
 
 @pytest.mark.parametrize(

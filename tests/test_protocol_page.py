@@ -9,11 +9,9 @@ from typing import Any
 
 import pytest
 
-import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
 from go1exp.base.report.table import Cell
-from go1exp.config.compose import compose
 from go1exp.evaluate.protocol import comparing
-from go1exp.evaluate.protocol.base import Played, chosen
+from go1exp.evaluate.protocol.base import Played
 from go1exp.evaluate.protocol.claims import evaluated
 from go1exp.evaluate.protocol.pages import (
     ACROSS,
@@ -27,11 +25,12 @@ from go1exp.evaluate.protocol.pages import (
 from go1exp.evaluate.protocol.playing import Result, summarised
 from go1exp.evaluate.statistics.intervals import Estimate, SummaryEntry
 from tests.phone import PHONE, needs_chromium, on_a_phone
+from tests.test_protocols import selected
 
 
 def made(name: str, label: str, rows: Callable[[Any], list[dict[str, Any]]], *overrides: str) -> Result:
     """Return a result with these rows, of nobody who walked."""
-    (one,), _ = chosen(compose("eval", [f"protocol={name}", *(f"protocol.{name}.{o}" for o in overrides)])["protocol"])
+    one = selected(name, *overrides)
     those = rows(one.protocol)
     figures = summarised(one, those)
     verdicts = evaluated(one.protocol.claims, figures)
@@ -118,7 +117,7 @@ def test_the_head_says_the_verdicts() -> None:
 
 def test_units_are_those_of_the_ground() -> None:
     """Where half pass is an angle on slopes and a height on gravel."""
-    (one,), _ = chosen(compose("eval", ["protocol=terrain"])["protocol"])
+    one = selected("terrain")
     half: dict[str, Estimate] = {
         "slope_up": {"estimate": 20.0, "low": 18.0, "high": 22.0, "n": 4, "unit": "deg"},
         "gravel": {"estimate": 0.05, "low": 0.04, "high": 0.06, "n": 4, "unit": "m"},

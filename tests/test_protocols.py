@@ -55,11 +55,12 @@ SMALL = {
     ),
     "robogauge": (
         *("robots=1", "frictions=[0.5,1.0]", "move_s=0.2", "stand_s=0.1", "pair_s=0.2", "settle_s=0.1"),
+        "~grounds",
         "grounds={slope:{lane:slope_up,levels:[1.0,2.0],course:0.5,speed:1.0,seconds:0.2,backward:false}}",
         "measures=[stride_rate]",
     ),
     "terrain": (
-        *("robots=1", "speeds=[8.0]", "slack=1.0", "grounds={slope_up:[5.0,10.0],gravel:[0.01,0.02]}"),
+        *("robots=1", "speeds=[8.0]", "slack=1.0", "~grounds", "grounds={slope_up:[5.0,10.0],gravel:[0.01,0.02]}"),
         "measures=[stride_rate]",
     ),
 }
@@ -79,13 +80,16 @@ def agent(make_task: Callable[..., TaskConfig]) -> PolicyAgent:
     return PolicyAgent("sway", make_task("backend.threads=1", "sim.physics_dt=0.005", "rand=table1"), sway)
 
 
-def small(name: str, *more: str) -> Chosen:
-    overrides = [f"++protocol.{name}.{o}" for o in (*SMALL[name], *more)]
-    if name in ("terrain", "robogauge"):
-        overrides.insert(0, f"~protocol.{name}.grounds")
-    (one,), grid = chosen(compose("eval", [f"protocol={name}", *overrides])["protocol"])
+def selected(name: str, *overrides: str) -> Chosen:
+    """A protocol of conf/protocol with some of its settings changed, or taken away (~)."""
+    changed = (f"~protocol.{name}.{o[1:]}" if o.startswith("~") else f"++protocol.{name}.{o}" for o in overrides)
+    (one,), grid = chosen(compose("eval", [f"protocol={name}", *changed])["protocol"])
     assert not grid
     return one
+
+
+def small(name: str, *more: str) -> Chosen:
+    return selected(name, *SMALL[name], *more)
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +121,7 @@ EVERY = list(members("protocol"))
 def test_every_protocol_has_a_file_and_a_small_size() -> None:
     assert set(EVERY) == set(SMALL)
     for name in EVERY:
-        (one,), _ = chosen(compose("eval", [f"protocol={name}"])["protocol"])
+        one = selected(name)
         assert one.kind == name
         assert one.protocol.claims
 
@@ -209,26 +213,19 @@ def stage(agent: Agent, **changes: Any) -> Stage:
     return Stage(agent, Setting(**{"noise": True, "randomize": True, "trunk_velocity": "exact", "seed": 1, **changes}))
 
 
-class Listening:
-    """A policy that keeps the command that it sees."""
+def test_a_command_is_seen_in_the_step_that_it_is_for(stands: PolicyAgent) -> None:
+    observations: list[Tensor] = []
 
-    def __init__(self) -> None:
-        self.seen: list[Tensor] = []
+    def listens(observation: Tensor) -> Tensor:
+        observations.append(observation.clone())
+        return stands.policy(observation)
 
-    def __call__(self, observation: Tensor) -> Tensor:
-        self.seen.append(observation.clone())
-        return torch.zeros(len(observation), 12)
-
-
-def test_a_command_is_seen_in_the_step_that_it_is_for(make_task: Callable[..., TaskConfig]) -> None:
-    policy = Listening()
-    task = make_task("backend.threads=1", "sim.physics_dt=0.005")
     command = np.zeros((6, 1, 3))
     command[:, 0, 0] = np.arange(6) * 0.1
-    quiet = stage(PolicyAgent("listens", task, policy), noise=False, randomize=False)
+    quiet = stage(dataclasses.replace(stands, policy=listens), noise=False, randomize=False)
     motion = quiet.run(Plan(command))
     np.testing.assert_allclose(motion.command[:, 0, 0], command[:, 0, 0], atol=1e-7)
-    seen = torch.cat(policy.seen).numpy()
+    seen = torch.cat(observations).numpy()
     column = [c for c in range(seen.shape[1]) if np.allclose(seen[:, c], command[:, 0, 0], atol=1e-6)]
     assert len(column) == 1
 
@@ -252,13 +249,10 @@ def test_a_session_that_is_put_back_does_the_same_again(agent: PolicyAgent) -> N
     assert np.array_equal(session.run(12).velocity, first.velocity)
 
 
-def test_a_kick_moves_a_robot_by_its_momentum(agent: PolicyAgent) -> None:
+def test_a_kick_moves_a_robot_by_its_momentum(stage: Stage) -> None:
     """In the air, before it touches: m dv is the impulse, whatever the legs do."""
-    task = dataclasses.replace(agent.task, rand=())
-    plain = PolicyAgent("stands", task, lambda observation: torch.zeros(len(observation), 12))
     kick = Impulses(np.zeros((1, 1)), np.full((1, 1), 6.4), np.full((1, 1), np.pi / 2), 0.02)
-    quiet = stage(plain, noise=False, randomize=False)
-    session = quiet.session(Plan(np.zeros((1, 1, 3)), impulses=kick))
+    session = stage.session(Plan(np.zeros((1, 1, 3)), impulses=kick))
     session.core.backend.qpos[:, 2] += 1.0
     session.run(1)
     model = session.core.backend.model
@@ -355,6 +349,14 @@ def test_a_robot_comes_back_when_it_does(agent: PolicyAgent) -> None:
             "gait protocol.gait.commands=[[0.0,1e30,0.0]]",
             "protocol.gait.commands.0.1 = 1e+30: must be from -100 to 100",
         ),
+        ("recover protocol.recover.stand.tilt=4.0", "protocol.recover.stand.tilt = 4.0"),
+        ("recover protocol.recover.push.impulse=1e300", "must be from 0 to 500 N s"),
+        ("recover protocol.recover.hold=[-1.0,1.0]", "protocol.recover.hold.0 = -1.0"),
+        ("recover protocol.recover.settle_s=0.0", "protocol.recover.settle_s = 0.0"),
+        ("robogauge protocol.robogauge.frictions=[0.5,0.5]", "protocol.robogauge.frictions: has 0.5 twice"),
+        ("robogauge protocol.robogauge.grounds.waves.levels=[0.2,0.1]", "grounds.waves.levels = [0.2, 0.1]: must rise"),
+        ("robogauge protocol.robogauge.pass_share=1.5", "protocol.robogauge.pass_share = 1.5"),
+        ("robogauge +protocol.robogauge.grounds.flat=null", "grounds.flat: has no levels and is always played"),
     ],
 )
 def test_a_wrong_protocol_is_refused_in_words(overrides: str, said: str) -> None:

@@ -2,48 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
-import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
 from go1exp import robot
-from go1exp.config.compose import compose
-from go1exp.config.schema.registry import ConfigError
 from go1exp.deploy.runtime.safety import SafetyConfig
 from go1exp.evaluate.agents import PolicyAgent
-from go1exp.evaluate.protocol.base import chosen
 from go1exp.evaluate.protocol.kinds.recover import Stand, posture, stood_up
 from go1exp.evaluate.protocol.plan import NEVER, Braking, Plan
 from go1exp.evaluate.protocol.playing import Rates, Result, play
-from go1exp.evaluate.protocol.stage import Setting, Stage
-from go1exp.sim.task import TaskConfig
-
-
-def made(*overrides: str) -> Any:
-    (one,), _ = chosen(compose("eval", ["protocol=recover", *overrides])["protocol"])
-    return one
-
-
-@pytest.fixture(scope="module")
-def stands(make_task: Callable[..., TaskConfig]) -> PolicyAgent:
-    """Robots that hold their stance."""
-    task = make_task("backend.threads=1", "sim.physics_dt=0.005", "rand=none")
-    return PolicyAgent("stands", task, lambda observation: torch.zeros(len(observation), 12))
-
-
-@pytest.fixture(scope="module")
-def stage(stands: PolicyAgent) -> Stage:
-    return Stage(stands, Setting(noise=False, randomize=False, trunk_velocity="exact", seed=1))
+from go1exp.evaluate.protocol.stage import Stage
+from tests.test_protocols import selected
 
 
 @pytest.fixture(scope="module")
 def result(stands: PolicyAgent) -> Result:
     small = ("robots=2", "settle_s=2.0", "seconds=1.0", "push.after_s=0.4", "brake.seconds=3.0")
-    return play(made(*(f"protocol.recover.{o}" for o in small)), stands, Rates(seed=1))
+    return play(selected("recover", *small), stands, Rates(seed=1))
 
 
 def test_a_robot_stands_from_the_time_on_from_which_it_holds_for_long_enough() -> None:
@@ -58,7 +35,7 @@ def test_a_robot_stands_from_the_time_on_from_which_it_holds_for_long_enough() -
 
 
 def test_robots_lie_on_side_and_back_at_rest_with_joints_all_over_their_range(stage: Stage) -> None:
-    protocol = made("protocol.recover.robots=6").protocol
+    protocol: Any = selected("recover", "robots=6").protocol
     start = np.stack([protocol.lying(stage, n) for n in range(12)])
     joints, stops = start[:, 7:], robot.JOINT_POS_LIMITS
     assert ((joints >= stops[:, 0]) & (joints <= stops[:, 1])).all()
@@ -111,15 +88,12 @@ def test_who_is_pushed_over_brakes_and_comes_to_rest(result: Result, stands: Pol
     assert all(r["toppled"] and r["fell"] and r["rested"] for r in pushed)
     assert all(0.2 < r["sink"] < 4.0 and 0.0 < r["rest_s"] < 3.0 for r in pushed)
     assert all(0.4 < r["moving_s"] < 1.5 for r in pushed)  # until the fall
-    gently = made("protocol.recover.robots=2", "protocol.recover.push.impulse=0.1", *SHORT)
+    gently = selected("recover", "robots=2", "push.impulse=0.1", *SHORT)
     still = [r for r in play(gently, stands, Rates(seed=1)).played.rows if r["case"] == "pushed"]
     assert not any(r["toppled"] or r["rested"] for r in still)
 
 
-SHORT = (
-    *("protocol.recover.settle_s=0.1", "protocol.recover.seconds=0.1", "protocol.recover.push.after_s=0.1"),
-    *("protocol.recover.brake.seconds=0.3", "protocol.recover.noise=false", "protocol.recover.randomize=false"),
-)
+SHORT = (*("settle_s=0.1", "seconds=0.1", "push.after_s=0.1", "brake.seconds=0.3", "noise=false", "randomize=false"),)
 
 
 def test_never_is_a_tilt_that_nothing_exceeds(stage: Stage) -> None:
@@ -129,18 +103,3 @@ def test_never_is_a_tilt_that_nothing_exceeds(stage: Stage) -> None:
     assert session.brake is not None
     assert session.brake.since.isinf().all()
     assert session.brake.torque_share[0] > 0.0
-
-
-@pytest.mark.parametrize(
-    ("override", "said"),
-    [
-        ("protocol.recover.stand.tilt=4.0", "protocol.recover.stand.tilt = 4.0"),
-        ("protocol.recover.push.impulse=1e300", "must be from 0 to 500 N s"),
-        ("protocol.recover.hold=[-1.0,1.0]", "protocol.recover.hold.0 = -1.0"),
-        ("protocol.recover.settle_s=0.0", "protocol.recover.settle_s = 0.0"),
-    ],
-)
-def test_a_wrong_setting_is_refused_in_words(override: str, said: str) -> None:
-    with pytest.raises(ConfigError) as caught:
-        made(override)
-    assert said in str(caught.value)

@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
 from go1exp import robot
-from go1exp.config.compose import compose
-from go1exp.config.schema.registry import ConfigError
 from go1exp.evaluate.agents import PolicyAgent
-from go1exp.evaluate.protocol.base import chosen
 from go1exp.evaluate.protocol.grading import (
     CHANNELS,
     METRICS,
@@ -29,28 +24,15 @@ from go1exp.evaluate.protocol.grading import (
     worse_half,
 )
 from go1exp.evaluate.protocol.ground import Lanes
-from go1exp.evaluate.protocol.kinds.robogauge import RoboGauge
 from go1exp.evaluate.protocol.plan import Motion, Plan
 from go1exp.evaluate.protocol.playing import Rates, play
-from go1exp.evaluate.protocol.stage import Setting, Stage
+from go1exp.evaluate.protocol.stage import Stage
 from go1exp.mdp.types import Snapshot
 from go1exp.sim.env.core import Go1Core
-from go1exp.sim.task import TaskConfig
 from go1exp.sim.terrain import build_terrain
+from tests.test_protocols import selected
 
 LARGEST = (1.0, 1.0, 1.5)
-
-
-def made(*overrides: str) -> Any:
-    (one,), _ = chosen(compose("eval", ["protocol=robogauge", *overrides])["protocol"])
-    return one
-
-
-@pytest.fixture(scope="module")
-def stands(make_task: Callable[..., TaskConfig]) -> PolicyAgent:
-    """Robots that hold their stance."""
-    task = make_task("backend.threads=1", "sim.physics_dt=0.005", "rand=none")
-    return PolicyAgent("stands", task, lambda observation: torch.zeros(len(observation), 12))
 
 
 # ---------------------------------------------------------------------- metrics by hand
@@ -145,7 +127,7 @@ def rows(levels: dict[str, tuple[int, int]], worst: float) -> list[dict[str, Any
 
 
 def test_the_table_of_fixed_figures_has_the_score_by_hand() -> None:
-    protocol: RoboGauge = made().protocol
+    protocol: Any = selected("robogauge").protocol
     fixed = rows({"waves": (4, 0), "obstacles": (2, 8)}, 0.5)
     figures = {(d.name, d.condition.get("ground")): d for d in protocol.derived(fixed)}
 
@@ -168,7 +150,7 @@ def test_the_table_of_fixed_figures_has_the_score_by_hand() -> None:
 
 def test_a_fall_makes_every_later_sample_zero() -> None:
     """One robot falls half through a sub-task of which it does everything else right; the other stays up."""
-    protocol: RoboGauge = made("protocol.robogauge.settle_s=0.0").protocol
+    protocol: Any = selected("robogauge", "settle_s=0.0").protocol
     steps, dt = 300, 0.02
     (task,) = [s for s in protocol.subtasks(LARGEST) if s.group == "pairs" and s.command == (1.0, 1.0, 0.0)]
     figures, command = np.zeros((steps, 2, CHANNELS)), np.tile(task.command, (steps, 2, 1))
@@ -188,7 +170,7 @@ def test_a_fall_makes_every_later_sample_zero() -> None:
 
 
 def test_the_subtasks_are_the_published_ones() -> None:
-    protocol: RoboGauge = made().protocol
+    protocol: Any = selected("robogauge").protocol
     tasks = protocol.subtasks(protocol.flat)
     assert [s.command for s in tasks if s.group == "axes"][:2] == [(2.0, 0.0, 0.0), (-2.0, 0.0, 0.0)]
     assert (len(tasks), len({s.command for s in tasks if s.group == "pairs"})) == (14, 8)
@@ -199,8 +181,7 @@ def test_the_subtasks_are_the_published_ones() -> None:
 
 
 def test_a_robot_that_stands_passes_nothing_and_does_not_follow(stands: PolicyAgent) -> None:
-    small = [f"++protocol.robogauge.{o}" for o in SMALL]
-    result = play(made("~protocol.robogauge.grounds", *small), stands, Rates(seed=1))
+    result = play(selected("robogauge", "~grounds", *SMALL), stands, Rates(seed=1))
     figures: dict[tuple[str, Any], Any] = {
         (name, e["condition"].get("ground")): f["estimate"] for e in result.summary for name, f in e["figures"].items()
     }
@@ -233,8 +214,7 @@ def test_who_passes_follows_the_commands_in_the_middle_of_the_highest_level(
         return dataclasses.replace(motion, way=motion.way + far)
 
     monkeypatch.setattr(Stage, "run", seen)
-    small = [f"++protocol.robogauge.{o}" for o in SMALL]
-    result = play(made("~protocol.robogauge.grounds", *small), stands, Rates(seed=1))
+    result = play(selected("robogauge", "~grounds", *SMALL), stands, Rates(seed=1))
     walked, followed, flat = plans
     assert (walked.robots, followed.robots, flat.robots) == (4, 14, 28)
     assert isinstance(followed.ground, Lanes)
@@ -256,16 +236,14 @@ def test_who_passes_follows_the_commands_in_the_middle_of_the_highest_level(
     assert found["estimate"] == pytest.approx(0.5 * (0.09 + 0.19 * row["quality_worst"]), rel=1e-4)
 
 
-def test_each_robot_has_its_own_friction(stands: PolicyAgent) -> None:
-    stage = Stage(stands, Setting(noise=False, randomize=False, trunk_velocity="exact", seed=1))
+def test_each_robot_has_its_own_friction(stage: Stage) -> None:
     friction = np.array([0.2, 0.9, 0.4])
     core = stage.session(Plan(np.zeros((1, 3, 3)), friction=(friction, friction))).core
     feet = core.backend.field("geom_friction")[:, core.backend.ids("geom", robot.FEET), 0]
     np.testing.assert_allclose(feet.numpy(), np.tile(friction[:, None], (1, 4)), rtol=1e-6)
 
 
-def test_the_figures_of_a_plan_take_the_memory_that_is_said(stands: PolicyAgent) -> None:
-    stage = Stage(stands, Setting(noise=False, randomize=False, trunk_velocity="exact", seed=1))
+def test_the_figures_of_a_plan_take_the_memory_that_is_said(stage: Stage) -> None:
     motion = stage.run(Plan(np.zeros((3, 2, 3)), figures=channels))
     assert motion.figures is not None
     assert motion.figures.shape == (3, 2, CHANNELS)
@@ -299,18 +277,3 @@ def test_the_highest_block_lies_in_the_way() -> None:
         assert height.max() == pytest.approx(level, rel=1e-4)
         assert terrain.heights.max() == pytest.approx(0.25, rel=1e-4)
         assert (height[x < lanes.goal - lanes.course - 0.6] == 0.0).all()
-
-
-@pytest.mark.parametrize(
-    ("override", "said"),
-    [
-        ("protocol.robogauge.frictions=[0.5,0.5]", "protocol.robogauge.frictions: has 0.5 twice"),
-        ("protocol.robogauge.grounds.waves.levels=[0.2,0.1]", "grounds.waves.levels = [0.2, 0.1]: must rise"),
-        ("protocol.robogauge.pass_share=1.5", "protocol.robogauge.pass_share = 1.5"),
-        ("+protocol.robogauge.grounds.flat=null", "grounds.flat: has no levels and is always played"),
-    ],
-)
-def test_a_wrong_setting_is_refused_in_words(override: str, said: str) -> None:
-    with pytest.raises(ConfigError) as caught:
-        made(override)
-    assert said in str(caught.value)

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
+from typing import cast
 
 import numpy as np
 import pytest
@@ -43,7 +44,7 @@ class Here:
         settings = SimConfig(noise=0.0, **config)  # type: ignore[arg-type]
         self.server = Server(Robot(body, settings), settings)
         self.probe = Probe(self.server, body, settings)
-        self.show = SimShow(self, body)
+        self.show = SimShow(cast(RobotProcess, self), body)
         self.clients = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
 
     def send(self, request: ask.Request) -> None:

@@ -50,8 +50,7 @@ def gl() -> str:
 
 @pytest.fixture
 def core(start_core: MakeCore) -> Go1Core:
-    core = start_core(*PLAIN, num_envs=2)
-    return core
+    return start_core(*PLAIN, num_envs=2)
 
 
 @pytest.fixture

@@ -202,14 +202,10 @@ class _Tally:
 
     def report(self, config: EvalConfig) -> dict[str, Any]:
         """Return the report: one row for each command, and the totals."""
-        total = float(self.samples.sum())
-        overall = (self.square_sum.sum(0) / total).sqrt() if total else None
+        each = [self.distinct(k, config) for k in range(len(config.commands))]
         return {
-            "commands": [self._row(k, command, config) for k, command in enumerate(config.commands)],
-            "rmse": _per_axis(overall) if overall is not None else None,
-            "falls": int(self.fell.sum()),
-            "episodes": len(self.fell),
-            "distinct_falls": self._falls(torch.cat([self.distinct(k, config) for k in range(len(config.commands))])),
+            "commands": [self._row(k, each[k], config) for k in range(len(config.commands))],
+            **self._totals(slice(None), torch.cat(each)),
             "settings": {k: v for k, v in dataclasses.asdict(config).items() if k != "commands"},
         }
 
@@ -233,20 +229,23 @@ class _Tally:
         by_figures = {tuple(row): first + i for i, row in reversed(list(enumerate(sums.tolist())))}
         return torch.tensor(sorted(by_figures.values()))
 
-    def _falls(self, robots: torch.Tensor) -> dict[str, float | None]:
-        return {"count": int(self.fell[robots].sum()), **share(int(self.fell[robots].sum()), len(robots))}
+    def _totals(self, robots: slice, distinct: torch.Tensor) -> dict[str, object]:
+        """Return errors and falls of some robots together; ``distinct`` are those without repeats."""
+        n, falls, fell = float(self.samples[robots].sum()), self.fell[robots], int(self.fell[distinct].sum())
+        return {
+            "rmse": _per_axis((self.square_sum[robots].sum(0) / n).sqrt()) if n else None,
+            "falls": int(falls.sum()),
+            "episodes": len(falls),
+            "distinct_falls": {"count": fell, **share(fell, len(distinct))},
+        }
 
-    def _row(self, k: int, command: Command, config: EvalConfig) -> dict[str, object]:
-        episodes = config.episodes
-        robots = slice(k * episodes, (k + 1) * episodes)
+    def _row(self, k: int, distinct: torch.Tensor, config: EvalConfig) -> dict[str, object]:
+        robots = slice(k * config.episodes, (k + 1) * config.episodes)
         n = float(self.samples[robots].sum())
         return {
-            "command": list(command),
+            "command": list(config.commands[k]),
             "mean": _per_axis(self.velocity_sum[robots].sum(0) / n) if n else None,
-            "rmse": _per_axis((self.square_sum[robots].sum(0) / n).sqrt()) if n else None,
-            "falls": int(self.fell[robots].sum()),
-            "episodes": episodes,
-            "distinct_falls": self._falls(self.distinct(k, config)),
+            **self._totals(robots, distinct),
             "mean_time_s": float(self.survived[robots].mean()),
         }
 
@@ -289,9 +288,7 @@ def delay_margin(
     of each delay that was run in what is returned; ``ms`` is None if robots fall without any.
     """
     runs, margin = {"0": falls}, None if falls["count"] else 0
-    for ms in DELAYS_MS:
-        if margin is None or runs[str(margin)]["count"]:
-            break
+    for ms in () if margin is None else DELAYS_MS:
         late = delayed(task, 1e-3 * ms)
         runs[str(ms)] = evaluate(late, policy, config, on_step, controller=controller)["distinct_falls"]
         if runs[str(ms)]["count"]:

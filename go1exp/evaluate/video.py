@@ -293,11 +293,8 @@ def live(core: Go1Core, policy: Policy, env: int = 0) -> None:
         core.command = FixedVelocity(core.random.stream("command"))
         core.command.value[:] = torch.tensor(command)
         observation = core.reset()
-        window.cam.azimuth, window.cam.elevation, window.cam.distance = (
-            view.AZIMUTH,
-            view.ELEVATION,
-            1.3 * view.DISTANCE,
-        )
+        camera, far = window.cam, 1.3 * view.DISTANCE
+        camera.azimuth, camera.elevation, camera.distance = view.AZIMUTH, view.ELEVATION, far
         due = time.perf_counter()
         while window.is_running():
             core.command.value[:] = torch.tensor(command)
@@ -306,7 +303,7 @@ def live(core: Go1Core, policy: Policy, env: int = 0) -> None:
             observation = result.observation
             with window.lock():
                 moved = stage.place(env)
-                window.cam.lookat[:] = stage.data.qpos[:3]
+                camera.lookat[:] = stage.data.qpos[:3]
                 window.user_scn.ngeom = 0
                 draw_velocities(window.user_scn, stage, core.command.value[env], stage.data.qvel[:2])
             if moved:

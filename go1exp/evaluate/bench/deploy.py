@@ -91,7 +91,6 @@ def _median_us(work: Callable[[], object]) -> float:
 
 
 def _walk(file: Path, seconds: float, out: Path) -> dict[str, float]:
-    """Walk once; return figures from the runtime's report."""
     times = ["--rate", str(RATE), "--seconds", str(seconds), "--stand-up", "0.2", "--brake", "0.1", "--stale", "5"]
     with SimulatedRobot(str(file), {}, {}) as robot:
         done = subprocess.run(

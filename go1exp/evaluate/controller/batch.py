@@ -16,7 +16,7 @@ from go1exp.base.tensors.rotation import rotate_inverse
 from go1exp.config.schema.registry import ConfigError
 from go1exp.deploy.estimation import Filters
 from go1exp.deploy.sim_robot.machine import noisy
-from go1exp.evaluate.controller.types import Controller, Savable, Sensed, TrunkVelocity
+from go1exp.evaluate.controller.types import Controller, Sensed, TrunkVelocity
 from go1exp.logs.record.simulate import sample
 from go1exp.robot.messages import LowCmd
 from go1exp.sim.env.core import Go1Core
@@ -76,7 +76,7 @@ class Driven:
 
     def save(self) -> Any | None:
         """Return a copy of the state; None if a controller or the filter cannot be restored."""
-        each = [one.save() for one in self.controllers if isinstance(one, Savable)]
+        each = [one.save() for one in self.controllers if hasattr(one, "save")]
         if self._estimates or len(each) < len(self.controllers):
             return None
         tensors = [tensor.clone() for tensor in self._tensors()]
@@ -87,7 +87,7 @@ class Driven:
         each, tensors, self._steps, self._feeds, rng = state
         self._rng = copy.deepcopy(rng)
         for one, of_controller in zip(self.controllers, each, strict=True):
-            assert isinstance(one, Savable)
+            assert hasattr(one, "load")
             one.load(of_controller)
         for tensor, value in zip(self._tensors(), tensors, strict=True):
             tensor.copy_(value)

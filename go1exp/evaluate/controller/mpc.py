@@ -94,7 +94,6 @@ class Mpc:
         return self._joint_commands(command)
 
     def _sense(self, sensed: Sensed) -> None:
-        """Smooth the readings, update the kinematic model, and advance the clock."""
         now = self._smoothed
         now.update(sensed)
         self._rotation = matrix(now.quat)

@@ -106,7 +106,10 @@ class Ground:
         """
         if self._settings.slope:
             share = 1.0 if self._fresh else self._share
-            self.gradient = self._limited(self.gradient + share * (_gradient(feet) - self.gradient))
+            self.gradient = self.gradient + share * (_gradient(feet) - self.gradient)
+            steepest, most = math.hypot(*self.gradient.tolist()), math.tan(self._settings.max_slope)
+            if steepest > most:
+                self.gradient = self.gradient * (most / steepest)
         a, b = self.gradient.tolist()
         below = [z - a * x - b * y for (x, y, z), stands in zip(feet.tolist(), down.tolist(), strict=True) if stands]
         vx, vy, vz = velocity.tolist()
@@ -114,10 +117,6 @@ class Ground:
         measured = robot.FOOT_RADIUS - sum(below) / len(below) if below else carried
         self.height = measured if self._fresh else carried + self._rise * (measured - carried)
         self._fresh = False
-
-    def _limited(self, gradient: np.ndarray) -> np.ndarray:
-        steepest, most = math.hypot(*gradient.tolist()), math.tan(self._settings.max_slope)
-        return gradient if steepest <= most else gradient * (most / steepest)
 
 
 def _gradient(feet: np.ndarray) -> np.ndarray:

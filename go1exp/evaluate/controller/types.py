@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -29,7 +29,10 @@ class Sensed:
 
 
 class Controller(Protocol):
-    """Controls one robot, called once every ``period`` s."""
+    """Controls one robot, called once every ``period`` s.
+
+    One that can go back to a saved state also has ``save``, which returns a copy of it, and ``load``, which takes that.
+    """
 
     period: float
 
@@ -38,17 +41,6 @@ class Controller(Protocol):
 
     def step(self, command: Command, sensed: Sensed) -> LowCmd:
         """Return the motors' command until the next call."""
-
-
-@runtime_checkable
-class Savable(Protocol):
-    """A controller whose state can be saved and restored."""
-
-    def save(self) -> Any:
-        """Return a copy of its state."""
-
-    def load(self, state: Any) -> None:
-        """Restore what ``save`` returned."""
 
 
 class AsTargets:

@@ -104,7 +104,6 @@ def limits(claim: Claim) -> str:
 
 
 def _bounds(claim: Claim) -> tuple[float, float]:
-    """Return the lower and upper limit of a claim, infinite where it has none."""
     least = -math.inf if claim.at_least is None else claim.at_least
     return least, math.inf if claim.at_most is None else claim.at_most
 

@@ -54,7 +54,6 @@ def compared(first: Result, other: Result) -> list[Difference]:
 
 
 def _pairs(first: Sequence[Row], other: Sequence[Row]) -> tuple[list[Row], list[Row]]:
-    """Return the rows of the robots that both subjects have, in the same order."""
     by_robot = {row[ROBOT]: row for row in other}
     kept = [row for row in first if row[ROBOT] in by_robot]
     return kept, [by_robot[row[ROBOT]] for row in kept]

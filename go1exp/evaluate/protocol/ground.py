@@ -17,15 +17,7 @@ from numpy.typing import NDArray
 from go1exp.sim.terrain import OBSTACLES, Terrain, TerrainConfig, as_stored, blocks
 
 GroundName = Literal[
-    "slope_up",
-    "slope_down",
-    "gravel",
-    "waves",
-    "crossed_waves",
-    "stairs_up",
-    "stairs_down",
-    "boxes",
-    "obstacles",
+    "slope_up", "slope_down", "gravel", "waves", "crossed_waves", "stairs_up", "stairs_down", "boxes", "obstacles"
 ]
 
 UNITS: dict[str, str] = {name: "deg" if name.startswith("slope") else "m" for name in get_args(GroundName)}
@@ -48,13 +40,11 @@ Shape = Callable[[Field, Field, float, float, np.random.Generator], Field]
 
 
 def _slope(x: Field, y: Field, difficulty: float, course: float, rng: np.random.Generator) -> Field:
-    rise = np.tan(np.radians(difficulty)) * np.clip(x, 0.0, course)
-    return np.broadcast_to(rise, np.broadcast_shapes(x.shape, y.shape))
+    return np.tan(np.radians(difficulty)) * np.clip(x, 0.0, course)
 
 
 def _stairs(x: Field, y: Field, difficulty: float, course: float, rng: np.random.Generator) -> Field:
-    steps = np.ceil(np.clip(x, 0.0, course) / TREAD - 1e-9)
-    return np.broadcast_to(difficulty * steps, np.broadcast_shapes(x.shape, y.shape))
+    return difficulty * np.ceil(np.clip(x, 0.0, course) / TREAD - 1e-9)
 
 
 def _gravel(x: Field, y: Field, difficulty: float, course: float, rng: np.random.Generator) -> Field:
@@ -62,8 +52,7 @@ def _gravel(x: Field, y: Field, difficulty: float, course: float, rng: np.random
 
 
 def _waves(x: Field, y: Field, difficulty: float, course: float, rng: np.random.Generator) -> Field:
-    wave = 0.5 * difficulty * (1.0 - np.cos(2.0 * np.pi * x / WAVE_LENGTH)) * _inside(x, course)
-    return np.broadcast_to(wave, np.broadcast_shapes(x.shape, y.shape))
+    return 0.5 * difficulty * (1.0 - np.cos(2.0 * np.pi * x / WAVE_LENGTH)) * _inside(x, course)
 
 
 def _crossed_waves(x: Field, y: Field, difficulty: float, course: float, rng: np.random.Generator) -> Field:
@@ -92,18 +81,11 @@ def _inside(x: Field, course: float) -> Field:
     return ((x > 0.0) & (x < course)).astype(float)
 
 
-SHAPES: dict[str, tuple[Shape, float]] = {
-    "slope_up": (_slope, 1.0),
-    "slope_down": (_slope, -1.0),
-    "gravel": (_gravel, 1.0),
-    "waves": (_waves, 1.0),
-    "crossed_waves": (_crossed_waves, 1.0),
-    "stairs_up": (_stairs, 1.0),
-    "stairs_down": (_stairs, -1.0),
-    "boxes": (_boxes, 1.0),
-    "obstacles": (_obstacles, 1.0),
+SHAPES: dict[str, Shape] = {
+    **{"slope_up": _slope, "slope_down": _slope, "stairs_up": _stairs, "stairs_down": _stairs, "gravel": _gravel},
+    **{"waves": _waves, "crossed_waves": _crossed_waves, "boxes": _boxes, "obstacles": _obstacles},
 }
-"""Height of a lane at x (1, n) after the run-up and y (m, 1), and its sign."""
+"""Height of a lane at x (1, n) after the run-up and y (m, 1): (m, n), or (1, n) whatever y is; or depth."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +107,7 @@ class Lanes(TerrainConfig):
 
     def build(self) -> Terrain:
         """Build the lanes; the start of each is its tile's origin, row 0."""
-        shape, sign = SHAPES[self.ground]
+        shape, sign = SHAPES[self.ground], -1.0 if self.ground.endswith("_down") else 1.0
         first, last = min(self.start, 0.0) - BEFORE, self.course + RUN_OUT
         per_lane, length = round(self.width / RESOLUTION), round((last - first) / RESOLUTION)
         margin = round(1.0 / RESOLUTION)  # an episode ends within it

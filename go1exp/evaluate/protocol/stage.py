@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from go1exp import robot
@@ -210,7 +209,10 @@ class Session:
             result = core.step(self._running(self._observation))
             core.check(result)
             self._observation = result.observation
-            self._end(result.terminated.numpy(), result.truncated.numpy())
+            # Who fell, or left the map, starts again and does not count any more.
+            self._fell |= self._alive & result.terminated.numpy()
+            self._left |= self._alive & result.truncated.numpy()
+            self._alive &= ~(result.terminated | result.truncated).numpy()
             if self._recorder and listening:
                 self._recorder.end_step(torch.from_numpy(self._alive))
             self._keep(kept, row)
@@ -240,12 +242,6 @@ class Session:
             turn = -self.plan.steer[0] * heading(qpos[:, 3:7]).numpy() - self.plan.along * self.plan.steer[1] * beside
             command[:, 2] = np.where(np.any(command != 0.0, axis=-1), np.clip(turn, -1.0, 1.0), 0.0)
         return torch.from_numpy(command)
-
-    def _end(self, terminated: NDArray[np.bool_], truncated: NDArray[np.bool_]) -> None:
-        """Count who fell and who left the map; they start again and do not count any more."""
-        self._fell |= self._alive & terminated
-        self._left |= self._alive & truncated
-        self._alive &= ~(terminated | truncated)
 
     def _keep(self, kept: dict[str, np.ndarray], row: int) -> None:
         s = self.core.snapshot()

@@ -168,8 +168,10 @@ def _described(name: str, first: RunRows, runs: dict[Path, RunRows]) -> Evaluati
     settings, protocol = first.settings, first.protocol
     if protocol is None:
         random = any(settings.get(key) for key in ("noise", "randomize", "push", "train_ground"))
-        distinct = {f: e if random else _first_robots(e) for f, e in runs.items()}
-        return Evaluation(name, AXES, _present(_grid_columns(), runs), MAIN, distinct, settings)
+        if not random:  # all robots of a command do the same: one row of each
+            firsts = {f: e.table[ROBOT] == 0.0 for f, e in runs.items()}
+            runs = {f: replace(e, table={k: v[firsts[f]] for k, v in e.table.items()}) for f, e in runs.items()}
+        return Evaluation(name, AXES, _present(_grid_columns(), runs), MAIN, runs, settings)
     columns = _present(protocol.columns(), runs)
     known = {c.name for c in columns if c.better}
     main = [c.quantity for c in protocol.claims.values() if c.quantity in known]
@@ -180,9 +182,3 @@ def _present(columns: Sequence[Column], runs: Mapping[Path, RunRows]) -> tuple[C
     """Return the quantities that rows have, without phases and the time in motion."""
     names = {name for rows in runs.values() for name in rows.table} - {MOVING.name}
     return tuple(c for c in columns if c.how != "phase" and c.name in names)
-
-
-def _first_robots(evaluated: RunRows) -> RunRows:
-    """Return one row of each command: without randomness all robots do the same."""
-    first = evaluated.table[ROBOT] == 0.0
-    return replace(evaluated, table={name: values[first] for name, values in evaluated.table.items()})

@@ -108,7 +108,6 @@ def _values(evaluation: Evaluation, group: Group, column: Column, rows: Rows | N
 
 
 def _means(values: Sequence[Floats]) -> Floats:
-    """Return the mean of each array, NaN of an empty one."""
     return np.array([float(each.mean()) if len(each) else math.nan for each in values])
 
 

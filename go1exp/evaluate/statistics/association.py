@@ -47,7 +47,6 @@ def spearman(x: ArrayLike, y: ArrayLike) -> tuple[float, float]:
 
 
 def _permuted(values: NDArray[np.float64], statistic: Callable[..., NDArray[np.float64]], alternative: str) -> Any:
-    """Return SciPy's permutation test of ``statistic`` over the pairings of ``values`` (n,)."""
     options = {"permutation_type": "pairings", "vectorized": True, "n_resamples": RESAMPLES, "rng": 0}
     return scipy.stats.permutation_test((values,), statistic, alternative=alternative, **options)
 

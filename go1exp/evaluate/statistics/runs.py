@@ -26,13 +26,12 @@ SIMULATED = 40_000  # normal samples for a critical value, which is then accurat
 Floats = NDArray[np.float64]
 
 
-def iqm(values: ArrayLike, axis: int | None = -1) -> Floats:
-    """Return the interquartile mean along an axis, or of all values (None), as rliable does: a trimmed mean.
+def iqm(values: ArrayLike) -> Floats:
+    """Return the interquartile mean over the last axis, (..., n) to (...), as rliable does: a trimmed mean.
 
     NaN where there is a NaN, or nothing; SciPy's ``trim_mean`` takes ten times as long for a few runs.
     """
     each = np.asarray(values, dtype=np.float64)
-    each = each.ravel() if axis is None else np.moveaxis(each, axis, -1)
     if not each.shape[-1]:
         return np.full(each.shape[:-1], np.nan)
     cut = int(TRIM * each.shape[-1])
@@ -58,7 +57,7 @@ def iqm_band(values: ArrayLike) -> tuple[Floats, Floats, Floats]:
     and McLaughlin 1963), with fewer than six runs that of all. Measured coverage: docs/notebook/studies.md.
     """
     each = np.asarray(values, dtype=np.float64)
-    middle = iqm(each, axis=0)
+    middle = iqm(each.T)
     if len(each) < 2:
         return middle, np.full_like(middle, np.nan), np.full_like(middle, np.nan)
     half = _critical(len(each)) * _standard_error(each.T)
@@ -197,7 +196,6 @@ def _p_of_ranks(ranks: tuple[tuple[float, ...], ...]) -> float:
 
 
 def _mean_difference(*ranks: NDArray[np.float64], axis: int = -1) -> NDArray[np.float64]:
-    """Return the mean of the first sample, minus that of a second one."""
     first = ranks[0].mean(axis=axis)
     return np.asarray(first - ranks[1].mean(axis=axis) if len(ranks) > 1 else first)
 

@@ -28,8 +28,7 @@ class Mailbox:
     def __init__(self, pipe: Connection) -> None:
         self._pipe, self._free = pipe, True
         self.waiting: dict[type[messages.Snapshot], messages.Snapshot] = {}
-        self._came: list[messages.Event] = []
-        self._newest: dict[type[messages.Snapshot], messages.Snapshot] = {}
+        self.newest: dict[type[messages.Snapshot], messages.Snapshot] = {}
         self.over = False
         self.events, self.snapshots = _Events(self), _Snapshots(self)
 
@@ -40,12 +39,8 @@ class Mailbox:
         except OSError:
             self.over = True
 
-    def offer(self, snapshot: messages.Snapshot) -> None:
-        """Send a snapshot as soon as the other end is free."""
-        self.waiting[type(snapshot)] = snapshot
-        self._pass_on()
-
-    def _pass_on(self) -> None:
+    def pass_on(self) -> None:
+        """Send the snapshots that wait, if the other end is free."""
         if self._free and self.waiting:
             self._free = False
             self.send("snapshots", list(self.waiting.values()))
@@ -53,28 +48,23 @@ class Mailbox:
 
     def new_events(self) -> list[messages.Event]:
         """Take in all that has come, and return its events; an end of Studio where the other end has gone."""
+        came: list[messages.Event] = []
         try:
             while self._pipe.poll():
                 kind, load = self._pipe.recv()
                 if kind == "event":
-                    self._came.append(load)
+                    came.append(load)
                 elif kind == "snapshots":
-                    self._newest |= {type(snapshot): snapshot for snapshot in load}
+                    self.newest |= {type(snapshot): snapshot for snapshot in load}
                     self.send("taken")
                 else:
                     self._free = True
         except (EOFError, OSError):
             self.over = True
-        self._pass_on()
+        self.pass_on()
         if self.over:
-            self._came.append(messages.ExitEvent())
-        events, self._came = self._came, []
-        return events
-
-    def new_snapshots(self) -> list[messages.Snapshot]:
-        """Return the snapshots that arrived with the last events: never one of a model that is not loaded yet."""
-        newest, self._newest = list(self._newest.values()), {}
-        return newest
+            came.append(messages.ExitEvent())
+        return came
 
     def close(self) -> None:
         """Close this end."""
@@ -101,13 +91,16 @@ class _Events(_Channel, messages.EventChannel):
 
 class _Snapshots(_Channel, messages.SnapshotChannel):
     def put(self, snapshot: messages.Snapshot) -> None:
-        self._box.offer(snapshot)
+        self._box.waiting[type(snapshot)] = snapshot
+        self._box.pass_on()
 
     def reclaim_unconsumed(self, snapshot_type: type[messages.Snapshot]) -> messages.Snapshot | None:
         return self._box.waiting.pop(snapshot_type, None)
 
     def get(self) -> list[messages.Snapshot]:
-        return self._box.new_snapshots()
+        """Return the snapshots that arrived with the last events: never one of a model that is not loaded yet."""
+        newest, self._box.newest = list(self._box.newest.values()), {}
+        return newest
 
 
 def _ends(box: Mailbox) -> dict[str, _Events | _Snapshots]:

@@ -6,7 +6,6 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from itertools import accumulate, pairwise
 
 import numpy as np
 import torch
@@ -34,16 +33,12 @@ class History:
         """Keep the last ``SPAN`` s."""
         self.dt, self.count = dt, 0
         self._rows = max(2, round(SPAN / dt))
-        ends = [0, *accumulate(widths.values())]
-        self._place = {name: slice(a, b) for name, (a, b) in zip(widths, pairwise(ends), strict=True)}
-        self._values = np.full((self._rows, ends[-1]), np.nan)
+        self._values = {name: np.full((self._rows, width), np.nan) for name, width in widths.items()}
 
     def add(self, quantities: Mapping[str, NDArray[np.floating]]) -> None:
         """Add a row; missing quantities are not drawn there."""
-        row = self._values[self.count % self._rows]
-        row.fill(np.nan)
-        for name, values in quantities.items():
-            row[self._place[name]] = values
+        for name, kept in self._values.items():
+            kept[self.count % self._rows] = quantities.get(name, np.nan)
         self.count += 1
 
     @property
@@ -62,7 +57,7 @@ class History:
 
     def series(self, name: str, every: int = 1) -> Array:
         """Return a quantity's rows (T, W), oldest first; every n-th of them for ``every`` = n."""
-        return np.asarray(self._values[self._indices(every) % self._rows, self._place[name]])
+        return np.asarray(self._values[name][self._indices(every) % self._rows])
 
     def last(self, name: str, seconds: float) -> Array:
         """Return the rows (T, W) of the last ``seconds`` s."""
@@ -156,7 +151,6 @@ class Session:
         self.core.command.value[:] = self.core.command.value.new_tensor(self.command)
 
     def _fresh(self) -> None:
-        """Clear the state of the last episode."""
         self._since = 0.0
         if self._estimate is not None:
             self._estimate.restart(0)

@@ -13,9 +13,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
-from typing import Protocol
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from go1exp import robot
@@ -23,13 +23,14 @@ from go1exp.base.errors import REFUSED, Expected
 from go1exp.base.signals import ending
 from go1exp.config.schema.registry import ConfigError
 from go1exp.deploy.sim_robot import SimConfig
-from go1exp.deploy.sim_robot.alone import Say, posture
+from go1exp.deploy.sim_robot.alone import Say, posture, serve
 from go1exp.deploy.sim_robot.machine import TICK, Body, Robot
 from go1exp.deploy.sim_robot.server import GONE_S, Server
 from go1exp.evaluate.protocol.plan import Kicker, heading
 from go1exp.evaluate.viewer import requests as ask
 from go1exp.evaluate.viewer.requests import active, catalogue
 from go1exp.evaluate.viewer.session import PushMade, one_push
+from go1exp.sim.task import required_parts
 
 Array = NDArray[np.float64]
 EVERY = 5  # ticks from row to row
@@ -186,27 +187,8 @@ class Probe:
 
 
 def _kicker(made: Robot) -> Kicker | None:
-    """Return what pushes a robot; None for a suspended one."""
     floats = made.backend.qpos.shape[1] > robot.NUM_JOINTS
     return Kicker(made.backend, TICK, one_push(math.nan, 0.0, 0.0)) if floats else None
-
-
-class Link(Protocol):
-    """Connection of the page to a robot."""
-
-    def send(self, request: ask.Request) -> None:
-        """Send a request of the user."""
-
-    def look(self) -> Frame | None:
-        """Return the next frame if it has arrived, without waiting; raise ``requests.Ended`` after the last one."""
-
-
-@dataclass(frozen=True)
-class Refused:
-    """The robot could not be built: the reasons, and whether they are problems of the settings."""
-
-    lines: tuple[str, ...]
-    settings: bool
 
 
 class RobotProcess:
@@ -242,10 +224,10 @@ class RobotProcess:
         try:
             answer = self._pipe.recv()
         except EOFError:
-            answer = Refused(("the simulated robot's process ended before it listened",), settings=False)
-        if isinstance(answer, Refused):
+            answer = Expected("the simulated robot's process ended before it listened")
+        if isinstance(answer, Exception):
             self.close()
-            raise ConfigError(list(answer.lines)) if answer.settings else Expected("\n".join(answer.lines))
+            raise answer
         self.address: tuple[str, int] = answer
         self._requests: list[ask.Request] = []
         self._waiting = False
@@ -255,7 +237,7 @@ class RobotProcess:
         self._requests.append(request)
 
     def look(self) -> Frame | None:
-        """Return the next frame if it has arrived, and ask for another one; see ``Link``."""
+        """Return the next frame if it has come, and ask for another; raise ``requests.Ended`` after the last one."""
         try:
             frame: Frame | None = None
             if self._waiting and self._pipe.poll():
@@ -286,21 +268,16 @@ def _run(
     say: Say,
 ) -> None:
     """Run the robot until the page's end of the pipe is closed."""
-    import torch
-
-    from go1exp.deploy.sim_robot.alone import serve
-    from go1exp.sim.task import required_parts
-
     torch.set_num_threads(1)
     sys.setswitchinterval(SWITCH_S)
     try:
         body = Body(**required_parts(groups), tile=tile)
         server = Server(Robot(body, config), config, address[1], address[0])
     except ConfigError as error:
-        pipe.send(Refused(tuple(error.problems), settings=True))
+        pipe.send(ConfigError(error.problems))
         return
     except Expected as error:
-        pipe.send(Refused((str(error),), settings=error.status == REFUSED))
+        pipe.send(ConfigError([str(error)]) if error.status == REFUSED else Expected(str(error)))
         return
     pipe.send(server.address)
     answering = Answering(Probe(server, body, config), pipe)

@@ -21,7 +21,7 @@ from go1exp.deploy.sim_robot.server import TRUTH
 from go1exp.evaluate.viewer import requests as ask
 from go1exp.evaluate.viewer.requests import catalogue, lines
 from go1exp.evaluate.viewer.session import PUSH_SHOWN_S, SPAN, History, PushMade
-from go1exp.evaluate.viewer.sim_process import FORCE, ROW_S, TORQUE, Frame, Link
+from go1exp.evaluate.viewer.sim_process import FORCE, ROW_S, TORQUE, Frame, RobotProcess
 from go1exp.evaluate.viewer.walk import Series, Timed, push_arrow, runs_of
 from go1exp.evaluate.viewer.window import MESSAGE_LINES, PLAIN, SLOW, LiveWindow, Vec2, paragraph, section
 from go1exp.sim.env.camera import Stage
@@ -62,7 +62,7 @@ class SimView(Timed):
 class SimShow:
     """Scene and curves of a robot that an external client commands."""
 
-    def __init__(self, link: Link, body: Body) -> None:
+    def __init__(self, link: RobotProcess, body: Body) -> None:
         self._link, self._body = link, body
         self._terrain = build_terrain(body.terrain)
         task = SimpleNamespace(robot=body.robot, sim=SimpleNamespace(physics_dt=TICK), contact=body.contact)

@@ -251,7 +251,6 @@ class LiveWindow(Window):
         implot.EndPlot()
 
     def _contacts(self, view: Timed) -> None:
-        """Draw a bar for each contact of a foot."""
         imgui.BeginGroup()
         for leg in robot.LEGS:
             imgui.TextUnformatted(leg)

@@ -1,6 +1,6 @@
 """The protocols. Importing the package registers every kind, from this explicit list."""
 
-from go1exp.evaluate.protocol.kinds import (
+from go1exp.evaluate.protocol.kinds import (  # noqa: F401
     corners,
     energy,
     gait,
@@ -13,17 +13,3 @@ from go1exp.evaluate.protocol.kinds import (
     sinusoid,
     terrain,
 )
-
-__all__ = [
-    "corners",
-    "energy",
-    "gait",
-    "hardware",
-    "kicks",
-    "push_map",
-    "rate",
-    "recover",
-    "robogauge",
-    "sinusoid",
-    "terrain",
-]

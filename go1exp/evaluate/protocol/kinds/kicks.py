@@ -7,7 +7,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from go1exp.base.report import plots
@@ -125,7 +124,6 @@ class Kicks(Protocol):
         return Played(rows, {"run": self._run(motion), "kicks": [self._after(motion, k) for k in range(count)]})
 
     def _row(self, motion: Motion, n: int, k: int, of_robot: Row) -> Row:
-        """Return what one kick did to one robot."""
         start = self.starts()[n, k]
         begin, end = (round(float(s) / motion.dt) for s in (start, start + self.every_s))
         end = min(end, len(motion.t))
@@ -140,7 +138,8 @@ class Kicks(Protocol):
         height, velocity = motion.height[:end, n], motion.velocity[:end, n, :2]
         rest = slice(begin - round(BEFORE / motion.dt), begin)
         speed = np.linalg.norm(velocity - velocity[rest].mean(0), axis=-1)
-        coarse = _coarse(begin, end, motion.dt)
+        coarse = np.round(np.arange(0.0, end * motion.dt, COARSE) / motion.dt).astype(int)  # from the run's start on
+        coarse = coarse[(coarse >= begin) & (coarse < end)]
         near = coarse[coarse < begin + PEAK_WITHIN / motion.dt]
         row |= {"min_height": float(height[begin:].min()), "min_height_25hz": float(height[coarse].min())}
         row["peak_speed"] = float(speed[begin : begin + round(PEAK_WITHIN / motion.dt)].max())
@@ -216,12 +215,6 @@ class Kicks(Protocol):
             plots.Drawing("coarse", "The same at 25 Hz, as the paper plots", one, partial(_run, run, coarse)),
             plots.Drawing("around", "Around each kick", every, partial(_around, around)),
         ]
-
-
-def _coarse(begin: int, end: int, dt: float) -> NDArray[np.intp]:
-    """Return the steps of samples at 25 Hz between two steps, on a clock that started with the run."""
-    steps = np.round(np.arange(0.0, end * dt, COARSE) / dt).astype(int)
-    return steps[(steps >= begin) & (steps < end)]
 
 
 def _smooth(values: Array, width: float, dt: float) -> Array:

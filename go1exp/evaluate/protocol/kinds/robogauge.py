@@ -232,7 +232,6 @@ class RoboGauge(Protocol):
         return {"ground": ground, ROBOT: n, "friction": self.frictions[n // self.robots]}
 
     def _conditions(self, robots: NDArray[np.intp]) -> dict[str, Any]:
-        """Return friction, delay and falls of the robots of a batch."""
         friction = np.array(self.frictions)[robots // self.robots]
         delay = 1e-3 * self.delay_ms * (robots % self.robots + 0.5) / self.robots
         fall = bind_list("termination", [{"tilt": {"max_angle": self.fall_tilt}}], "fall_tilt")
@@ -293,7 +292,6 @@ def _levels(rows: Sequence[Row], share: float) -> dict[float, int]:
 
 
 def _level(rows: Sequence[Row], share: float) -> float:
-    """Return the level of one ground, mean over frictions."""
     levels = _levels(rows, share)
     return float(np.mean(list(levels.values()))) if levels else np.nan
 
@@ -309,7 +307,6 @@ def _score(rows: Sequence[Row], share: float) -> float:
 
 
 def _overall(rows: Sequence[Row], function: Callable[..., float], share: float) -> float:
-    """Return the mean of a figure over grounds."""
     figures = [function(those, share) for those in by_condition(rows, ("ground",)).values()]
     known = [figure for figure in figures if np.isfinite(figure)]
     return float(np.mean(known)) if known else np.nan
