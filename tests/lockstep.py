@@ -115,9 +115,9 @@ class InProcess:
         self.world.closed = True
         empty = Deadlines(TICK, 1).timing()
         self.report = asdict(self._server.counts) | {"timing": asdict(empty)}
-        self.applied = self._server.applied.rows()
-        rows = self._server.truth.rows()
-        if not np.isnan(rows).any():
+        self.applied = np.array(self._server.applied)
+        rows = np.array(self._server.truth)
+        if len(rows) and not np.isnan(rows).any():
             self.truth = dict(zip(("clock", *TRUTH), rows.T, strict=True))
         self._server.close()
 

@@ -50,7 +50,7 @@ from go1exp.deploy.runtime.safety import RULES
 from go1exp.deploy.runtime.walk import FAULTS, STATUS, Plan
 from go1exp.deploy.sim_robot.__main__ import bundle_task, sim_config
 from go1exp.deploy.sim_robot.machine import NOISE, TICK, Robot, turned
-from go1exp.deploy.sim_robot.server import TRUTH, Network, Newest
+from go1exp.deploy.sim_robot.server import TRUTH, Network
 from go1exp.evaluate.controller.mpc import Mpc
 from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
 from go1exp.evaluate.controller.types import Deployed
@@ -149,15 +149,6 @@ def test_jitter_delays_each_datagram_by_its_own_and_lets_one_overtake_another() 
     assert late.mean() == pytest.approx(0.4 * 0.006 + 0.4 * 0.008 + 0.2 * 0.010, abs=2e-4)
     order = np.array(list(arrived))
     assert (np.diff(order) < 0).mean() > 0.1
-
-
-def test_of_the_truth_the_newest_is_kept_and_memory_does_not_grow() -> None:
-    truth = Newest(2, kept=25.0)
-    for k in range(40_000):
-        truth.add(TICK * k, np.array([k, -k]))
-    rows = truth.rows()
-    assert 25.0 <= TICK * len(rows) <= 45.0
-    np.testing.assert_array_equal(rows[:, 1], np.arange(40_000 - len(rows), 40_000))
 
 
 @pytest.mark.parametrize(
@@ -350,7 +341,7 @@ def test_a_robot_stands_up_into_the_stance_and_is_handed_over_without_a_jump(
     job = {"sim": {"start": start, "noise": 0.0}, "truth": True}
     done = play(bundle, tmp_path, stand_up=1.0, hand_over=0.3, seconds=0.3, job=job)
     assert done.status == 0
-    rows = done.world.server.truth.rows()
+    rows = np.array(done.world.server.truth)
     assert rows[0, 1 + TRUTH.index("base_pos_z_w")] < 0.2
     phase = np.array(PHASES)[done.cycles["phase"].astype(int)]
     first = int(np.argmax(phase == "handing_over"))
@@ -371,7 +362,7 @@ def test_a_robot_stands_up_into_the_stance_and_is_handed_over_without_a_jump(
 
 def ended(done: SimpleNamespace) -> tuple[float, float, np.ndarray]:
     """Return height in the end, the largest speed downwards since the walk's end, and the heights since braking."""
-    rows = done.world.server.truth.rows()
+    rows = np.array(done.world.server.truth)
     place = {name: rows[:, 1 + k] for k, name in enumerate(TRUTH)}
     begins = done.account["phases"]
     since = rows[:, 0] >= begins.get("lying_down", begins["damping"]) - BEGIN

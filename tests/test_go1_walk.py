@@ -170,7 +170,7 @@ def watched(
         patch.setattr(KalmanEstimator, "update", listening)
         assert run_job(Job(walking, "sim", plan, str(out), sim=RAW, feet=feet), said.append) == 0, said
         assert world.server is not None
-        rows = world.server.truth.rows()
+        rows = np.array(world.server.truth)
     truth = dict(zip(("clock", *TRUTH), rows.T, strict=True))
     return Watched(states, np.array(velocities), truth, said)
 
@@ -230,7 +230,7 @@ def test_a_calibration_without_scales_is_refused_before_anything_moves(bundle: s
 
 def server(bundle: str, **sim: Any) -> Server:
     config = sim_config({"noise": 0.0, **sim})
-    return Server(Robot(bundle_task(bundle, {}), config), config)
+    return Server(Robot(bundle_task(bundle, {}), config), config, kept=0.1)
 
 
 @contextmanager
@@ -277,6 +277,8 @@ def test_a_robot_holds_its_pose_until_a_command_and_brakes_when_nobody_speaks(bu
         for _ in range(200):
             client.sendto(wire.IDLE, to)
             made.tick()
+        assert len(made.truth) == len(made.applied) == 51  # the newest 0.1 s
+        assert made.truth[-1][0] == made.applied[-1][0] == pytest.approx(made.robot.clock - TICK)
         assert made.robot.truth[2] > 0.25  # it stands, as by its maker's own controller
         client.sendto(wire.pack_command(low_cmd()), to)
         made.tick()
