@@ -74,10 +74,9 @@ def steps(
 
 
 class _Edges:
-    """The instants at which the target of each joint jumps, s, and the angle it jumps to, rad."""
+    """The instants at which the target of each joint jumps, s, and the angle it jumps to, rad; first its centre."""
 
     def __init__(self, centre: np.ndarray) -> None:
-        """Start with every joint at its ``centre`` (J,), rad."""
         self._centre = centre
         self._edges: list[list[tuple[float, float]]] = [[(0.0, float(c))] for c in centre]
 

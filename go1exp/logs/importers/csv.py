@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -212,7 +211,7 @@ def _recordings(
                 if left := len(rows) - len(kept):
                     remarks.append(f"{counted(left, 'row')} with the time of the row before: left out.")
                 rows = kept
-            check_clock(where, channels["t"][rows], cells[rows], clock.column, partial(_place, table, rows))
+            check_clock(where, channels["t"][rows], cells[rows], clock.column, table.place, rows)
             remarks.append(f"t = 0 is {cells[rows[0]]} in the column {clock.column!r}.")
             series = {key: values[rows] for key, values in channels.items()}
             series["t"] = series["t"] - series["t"][0]
@@ -237,10 +236,6 @@ def _remarks(table: Table, wanted: Mapping[str, str], notes: str) -> list[str]:
     if table.units:
         remarks.append(f"Units of the line below the names: {', '.join(filter(None, table.units.values()))}.")
     return remarks
-
-
-def _place(table: Table, rows: np.ndarray, k: int) -> str:
-    return table.place(int(rows[k]))
 
 
 def _with_units(path: Path, mapping: Mapping[str, Column], units: Mapping[str, str]) -> dict[str, Column]:

@@ -10,8 +10,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from go1exp.config.schema.registry import Positive, explain, importer
-from go1exp.logs.importers.source import LEVEL, Arrays, columns, files, joint_columns, load_npz, recording, reorder
-from go1exp.logs.recording import VECTORS, Quaternion, Recording, RecordingError
+from go1exp.logs.importers.source import LEVEL, Arrays, files, load_npz, recording, reorder
+from go1exp.logs.recording import VECTORS, Quaternion, Recording, RecordingError, columns, joint_columns
 from go1exp.robot import JOINT_KINDS, JOINTS
 
 # ---------------------------------------- dfki-ric-underactuated-lab/double_pendulum, BSD 3-Clause
@@ -57,7 +57,7 @@ def _double_pendulum(path: Path, design: str | None) -> Recording:
     if followed:
         names["q_target"] = "pos_des"
     for quantity, name in names.items():
-        channels |= joint_columns(quantity, SHOULDER_ELBOW, _pair(data, name))
+        channels |= {f"{quantity}_{joint}": data.numbers(f"{name}{k}") for k, joint in enumerate(SHOULDER_ELBOW, 1)}
     return recording(
         path,
         "ak80_double_pendulum",
@@ -70,13 +70,6 @@ def _double_pendulum(path: Path, design: str | None) -> Recording:
         episode=f"ak80_{design.lower()}_{path.stem}",
         notes=PENDULUM_NOTES.format(design=design) + (FOLLOWED if followed else OPEN_LOOP),
     )
-
-
-def _pair(data: Arrays, name: str) -> np.ndarray:
-    first, second = data.numbers(f"{name}1"), data.numbers(f"{name}2")
-    if len(first) != len(second):
-        raise RecordingError(f"{data.path}: {name}1 has {len(first)} values, {name}2 has {len(second)}")
-    return np.stack([first, second], axis=1)
 
 
 def _design(path: Path) -> str:

@@ -11,8 +11,8 @@ from pydantic import AliasChoices, Field
 
 import go1exp.logs.importers.bags as bags
 from go1exp.config.schema.registry import NonNegative, Positive, importer
-from go1exp.logs.importers.source import columns, files, recording
-from go1exp.logs.recording import FOOT_FORCE, VECTORS, Quaternion, Recording, RecordingError
+from go1exp.logs.importers.source import files, recording
+from go1exp.logs.recording import FOOT_FORCE, VECTORS, Quaternion, Recording, RecordingError, columns
 from go1exp.robot import JOINTS, LEGS
 
 PACKAGES = ("unitree_go", "ros2_unitree_legged_msgs", "unitree_legged_msgs")
