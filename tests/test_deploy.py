@@ -37,7 +37,6 @@ from go1exp.deploy.runtime.commands import (
     make,
     parsed,
     range_array,
-    split_keys,
     stretched,
 )
 from go1exp.deploy.runtime.controller import LYING, PHASES, STANCE_ERROR, Cycle
@@ -651,15 +650,15 @@ def test_keys_change_the_velocity_and_stop_the_robot() -> None:
             source.poll()
             np.testing.assert_allclose(source(0.0), expected, atol=1e-9)
         assert stops == []
-        for key in (b"\x1b", b"q"):
+        for key in (b"w\x1b[A\x1b", b"q"):
             os.write(ours, key)
             source.poll()
         assert stops == ["key Esc", "key q"]
+        np.testing.assert_allclose(source(0.0), [0.2, -0.1, 0.0], atol=1e-9)
     finally:
         source.close()
         os.close(ours)
         os.close(theirs)
-    assert split_keys("w\x1b[A\x1b") == ["w", "\x1b[A", "\x1b"]
 
 
 def make_keyboard(descriptor: int, stops: list[str]) -> Keyboard:

@@ -191,7 +191,10 @@ def load(path: str | Path) -> Bundle:
 def loads(data: bytes, source: str) -> Bundle:
     """Read a bundle from its bytes; ``source`` is its name in messages. Errors as ``load``'s."""
     members = unpack(data, MEMBERS, source)
-    metadata = _metadata(members[METADATA], source)
+    try:
+        metadata = Metadata.from_dict(_json(members[METADATA], f"{source}: {METADATA}"))
+    except ValueError as error:
+        raise BundleError(f"{source}: {METADATA}: {error}") from None
     try:
         policy = OnnxPolicy(members[POLICY], metadata.inputs, metadata.outputs)
     except ValueError as error:
@@ -244,13 +247,6 @@ def _check_action(trace: Mapping[str, np.ndarray], metadata: Metadata, source: s
         raise BundleError(f"{source}: {METADATA}: nominal_stance and action_scale are not those of the trace")
     if not float(np.max(np.abs(action))) <= metadata.action_clip + TOLERANCE:
         raise BundleError(f"{source}: {METADATA}: action_clip is not that of the trace")
-
-
-def _metadata(content: bytes, source: str) -> Metadata:
-    try:
-        return Metadata.from_dict(_json(content, f"{source}: {METADATA}"))
-    except ValueError as error:
-        raise BundleError(f"{source}: {METADATA}: {error}") from None
 
 
 def _json(content: bytes, where: str) -> dict[str, Any]:

@@ -161,7 +161,8 @@ class Keyboard(Constant):
             if not data:
                 self._stop("end of the terminal")
                 return
-            for key in split_keys(data.decode(errors="replace")):
+            # An arrow is three characters, Esc alone is one.
+            for key in re.findall(r"\x1b[\[O].?|.", data.decode(errors="replace"), re.DOTALL):
                 self._press(key)
 
     def _press(self, key: str) -> None:
@@ -180,11 +181,6 @@ class Keyboard(Constant):
 
             self._open = False
             termios.tcsetattr(self._keys, termios.TCSADRAIN, self._before)
-
-
-def split_keys(text: str) -> list[str]:
-    """Split the characters of a terminal into keys: an arrow is three characters, Esc alone is one."""
-    return re.findall(r"\x1b[\[O].?|.", text, re.DOTALL)
 
 
 DEAD = 0.1

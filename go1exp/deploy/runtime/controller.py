@@ -58,7 +58,6 @@ class Stages:
     patience: float = 5.0
 
     def __post_init__(self) -> None:
-        """Check the times."""
         times = ("stand_up", "hand_over", "lie_down", "brake")
         problems = [f"{k} = {getattr(self, k)}: must be at least 0" for k in times if not getattr(self, k) >= 0.0]
         if not self.patience > 0.0:

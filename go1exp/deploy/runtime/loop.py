@@ -114,7 +114,6 @@ class Timing:
         return self.missed / max(self.cycles + self.left_out, 1)
 
     def __str__(self) -> str:
-        """Return a line for the terminal and the log."""
         period = f"period p50 {1e3 * self.period_p50:.3f}, p99 {1e3 * self.period_p99:.3f}, "
         period += f"worst {1e3 * self.period_worst:.3f} ms"
         work = (
@@ -124,10 +123,9 @@ class Timing:
 
 
 class Deadlines:
-    """Counts cycles and deadlines of a loop; allocates memory only when it is built."""
+    """Counts cycles of ``period`` s and deadlines of a loop; allocates memory only when it is built."""
 
     def __init__(self, period: float, kept: int = KEPT) -> None:
-        """Start counting cycles of ``period`` s."""
         self._period = period
         self._periods, self._work = np.zeros(kept), np.zeros(kept)
         self.cycles = self.missed = self.left_out = 0

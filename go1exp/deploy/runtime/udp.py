@@ -258,7 +258,6 @@ class PacketDelay:
     """Delays of packets relative to the fastest of the last ``WINDOW_S``."""
 
     def __init__(self) -> None:
-        """Start without any packet."""
         # Arrival and offset. Offsets increase, so that the first is the least.
         self._least: deque[tuple[float, float]] = deque()
 
