@@ -17,7 +17,7 @@ import pytest
 from go1exp import robot
 from go1exp.deploy.runtime import loop as loop_module
 from go1exp.deploy.runtime.bundle import Bundle
-from go1exp.deploy.runtime.controller import STAND_KD, STAND_KP, Controller, Cycle, Stages
+from go1exp.deploy.runtime.controller import STAND_KD, STAND_KP, Controller, Cycle, Estimator, Stages
 from go1exp.deploy.runtime.loop import Deadlines, MonotonicClock, Timing, run
 from go1exp.deploy.runtime.metadata import Port
 from go1exp.deploy.runtime.safety import RULES, Safety, SafetyConfig, sdk_range, tilt_angle
@@ -250,7 +250,7 @@ class FakePolicy:
         return {"joint_target": target, "observation": readings["joint_pos"], "action": action}
 
 
-class Velocity:
+class Velocity(Estimator):
     """An estimator that counts."""
 
     def __init__(self, fails_at: int = 10**9, how: str = "nan") -> None:
@@ -518,7 +518,7 @@ def test_gains_that_nobody_knows_have_to_be_given() -> None:
 # ---------------------------------------------------------------------- the loop
 
 
-class FakeClock:
+class FakeClock(MonotonicClock):
     """Time that passes only while somebody works or sleeps; a sleeper wakes ``late`` s after the time."""
 
     def __init__(self, late: Callable[[int], float] = lambda sleep: 0.0) -> None:

@@ -179,12 +179,7 @@ def run_job(job: Job, say: Say) -> int:
 
 
 def _prepare(job: Job, bundle: Bundle, feet: FootCalibration | None, say: Say) -> None:
-    """Refuse what cannot walk before anything is started, and report the choices that were made.
-
-    Raises:
-        go1exp.base.errors.Expected: if the bundle is unfit, or its commands are not available.
-        OSError: if a file cannot be read, or the folder of the logs not written.
-    """
+    """Refuse what cannot walk before anything is started, and report the choices that were made."""
     about, plan = bundle.metadata, job.plan
     refuse_unfit(bundle)
     if about.kp is None or about.kd is None:
@@ -228,12 +223,7 @@ BY_BOTH = "foot contact: from joint torques and the foot sensors, calibrated by 
 
 
 def _calibration(job: Job) -> FootCalibration | None:
-    """Return the calibration of the foot sensors, if there is one.
-
-    Raises:
-        RefusedError: if the sensors need none.
-        go1exp.deploy.estimation.feet.CalibrationError: if the file is invalid, or has no scales yet.
-    """
+    """Return the calibration of the foot sensors, if there is one; refuse one that is invalid, or is not needed."""
     if job.feet is None:
         return None
     if not job.counting:
@@ -245,7 +235,6 @@ def _calibration(job: Job) -> FootCalibration | None:
 
 
 def _about(job: Job, bundle: Bundle) -> About:
-    """Return the origin of a walk's log."""
     about = bundle.metadata
     gains = gains_on_wire(*(job.gains or (np.array(about.kp), np.array(about.kd))))
     return About(

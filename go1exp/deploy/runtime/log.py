@@ -239,7 +239,6 @@ UNKNOWN_DELAY = (
 
 
 def _meta(about: About, channels: Mapping[str, np.ndarray], notes: str) -> Meta:
-    """Return the description of a recording with these channels."""
     from go1exp.logs.recording import VECTORS, Meta
 
     return Meta(

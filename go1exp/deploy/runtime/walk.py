@@ -19,7 +19,7 @@ from go1exp.deploy.estimation.feet import FootCalibration
 from go1exp.deploy.runtime.bundle import Bundle
 from go1exp.deploy.runtime.commands import CommandConfig, Limited, make, range_array
 from go1exp.deploy.runtime.controller import STAND_PATIENCE, Controller, Cycle, Estimator, Mover, Stages
-from go1exp.deploy.runtime.estimate import BOTH, TORQUE, KalmanEstimator, NoEstimator, settings
+from go1exp.deploy.runtime.estimate import BOTH, TORQUE, KalmanEstimator, settings
 from go1exp.deploy.runtime.log import Log
 from go1exp.deploy.runtime.loop import MonotonicClock, Timing, run
 from go1exp.deploy.runtime.safety import Fault, Safety, SafetyConfig
@@ -130,7 +130,7 @@ def _estimator(
 ) -> Estimator:
     """Return the estimator of a bundle's policy; none if the policy has no use for it, unless ``needed``."""
     if not needed and all(port.name != "base_lin_vel_b" for port in bundle.policy.inputs):
-        return NoEstimator()
+        return Estimator()
     changes: dict[str, str | float] = {}
     if contact == "torque":
         changes = TORQUE if feet is None else BOTH
@@ -139,8 +139,6 @@ def _estimator(
 
 
 class _Walk:
-    """A walk in progress: its cycle, and its end."""
-
     def __init__(
         self,
         bundle: Bundle,
