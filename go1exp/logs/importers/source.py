@@ -282,12 +282,6 @@ def rate(path: Path, t: np.ndarray) -> float:
     return float(f"{1 / step:.{RATE_DIGITS}g}")
 
 
-def reorder(theirs: Iterable[str], ours: Iterable[str]) -> list[int]:
-    """Return the index that puts the joints of a source into our order, by name."""
-    place = {name: i for i, name in enumerate(theirs)}
-    return [place[name] for name in ours]
-
-
 def recording(path: Path, importer: str, channels: dict[str, np.ndarray], **about: Any) -> Recording:
     """Build a recording and check it; ``about`` are further fields of ``Meta``.
 
