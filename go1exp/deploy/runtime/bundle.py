@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from go1exp.base.errors import Unusable
-from go1exp.deploy.runtime.metadata import Metadata, Port
+from go1exp.deploy.runtime.metadata import Metadata
 from go1exp.deploy.runtime.policy import OnnxPolicy
 
 MANIFEST = "manifest.json"
@@ -276,11 +276,8 @@ def _trace(content: bytes, metadata: Metadata, source: str) -> dict[str, np.ndar
             arrays = {name: np.asarray(file[name]) for name in file.files}
     except Exception as error:  # damage of a zip and of the arrays in it has many forms
         raise BundleError(f"{source}: {TRACE}: not NumPy's arrays ({error})") from None
-
-    def port_sizes(prefix: str, ports: tuple[Port, ...]) -> dict[str, int]:
-        return {f"{prefix}.{port.name}": port.size for port in ports}
-
-    sizes = {**port_sizes("input", metadata.inputs), **port_sizes("output", metadata.outputs)}
+    ports = {"input": metadata.inputs, "output": metadata.outputs}
+    sizes = {f"{kind}.{port.name}": port.size for kind, some in ports.items() for port in some}
     if arrays.keys() != {"time", *sizes}:
         odd = ", ".join(sorted(arrays.keys() ^ {"time", *sizes}))
         raise BundleError(f"{source}: {TRACE}: arrays missing or too many: {odd}")
