@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from go1exp import robot
 from go1exp.deploy.estimation import Status, go1, make_filter, sample
 from go1exp.deploy.runtime.estimate import LONGEST_AHEAD, KalmanEstimator, acceleration
 from go1exp.deploy.runtime.report import summary_lines
 from go1exp.deploy.runtime.udp import MOST_SLIP, WINDOW_S, PacketDelay, delays, slip, spread
 from go1exp.robot.go1_fields import PERIOD
 from go1exp.robot.messages import OVERTAKEN_S, LowState
-from tests.made import low_state
+from tests.made import shaking_state
 
 
 def test_delays_are_those_beyond_the_fastest_of_the_last_second() -> None:
@@ -90,11 +89,9 @@ def test_the_change_of_the_velocity_is_that_of_a_body_that_turns_and_is_pushed()
 
 
 def state_at(k: int) -> LowState:
-    rng = np.random.default_rng(k)
-    noisy = {"joint_pos": robot.NOMINAL_STANCE + 0.01 * rng.normal(size=12), "joint_vel": rng.normal(size=12)}
-    noisy |= {"joint_torque": rng.normal(size=12), "imu_gyro": 0.1 * rng.normal(size=3)}
-    acc = np.array([0.5, -0.3, 9.81]) + rng.normal(size=3)
-    return low_state(7.0 + PERIOD * k, clock=PERIOD * k, imu_acc=acc, **noisy)
+    """A state that arrives by another clock than the robot's own."""
+    acc = np.array([0.5, -0.3, 9.81]) + np.random.default_rng(1000 + k).normal(size=3)
+    return shaking_state(k, 7.0 + 1.05 * PERIOD * k, clock=PERIOD * k, imu_acc=acc)
 
 
 def made() -> KalmanEstimator:
