@@ -349,15 +349,6 @@ def test_the_estimator_gets_every_state_once_and_the_policy_the_newest_estimate(
     assert [readings["base_lin_vel_b"][0, 0] for readings in made.policy.calls] == [5.0 * k for k in range(11, 21)]
 
 
-def test_a_gait_clock_begins_when_walking_begins() -> None:
-    made = controller()
-    made.run_cycles(30)
-    walking = [cycle.t for cycle in made.log if cycle.phase == "walking"]
-    walked = [float(readings["walked"][0, 0]) for readings in made.policy.calls]
-    np.testing.assert_allclose(walked, np.array(walking) - walking[0], atol=1e-6)
-    assert walked[-1] > 0.1
-
-
 def test_at_another_rate_the_previous_action_is_the_mean_over_a_training_period() -> None:
     made = controller(commands=lambda t: np.array([1.0 + t, 0.0, 0.0]), rate=100.0)  # 4 cycles in a training period
     made.run_cycles(30)
@@ -422,11 +413,14 @@ def test_the_reach_of_a_target_follows_the_gains() -> None:
     assert other == alone != first
 
 
-def test_the_command_source_is_asked_for_the_time_since_walking_began() -> None:
+def test_a_gait_clock_and_the_command_source_are_told_the_time_since_walking_began() -> None:
     asked: list[float] = []
     made = controller(commands=lambda t: asked.append(t) or np.zeros(3))  # type: ignore[func-returns-value]
-    made.run_cycles(15)
-    np.testing.assert_allclose(asked, 0.01 * np.arange(5), atol=1e-9)
+    made.run_cycles(30)
+    walking = [cycle.t for cycle in made.log if cycle.phase == "walking"]
+    assert walking[0] == pytest.approx(0.1)
+    np.testing.assert_allclose(asked, np.array(walking) - walking[0], atol=1e-9)
+    np.testing.assert_allclose([readings["walked"][0, 0] for readings in made.policy.calls], asked, atol=1e-6)
 
 
 def silent_after(cycle: int) -> Callable[[int], Sequence[LowState]]:

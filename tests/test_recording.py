@@ -62,10 +62,6 @@ def plant(path: Path, columns: dict[str, Any], metadata: dict[bytes, bytes] | No
     return path
 
 
-def columns(recording: Recording) -> dict[str, np.ndarray]:
-    return dict(recording.channels)
-
-
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     return tmp_path / "episode.parquet"
@@ -134,7 +130,7 @@ def test_the_contact_of_the_model_comes_back_and_files_without_one_have_none(pat
     assert same(rec.read(path), written)
     text = json.loads(pq.read_schema(path).metadata[rec.KEY])
     assert text["contact"] == {"time_constant": 0.005, "cone": "elliptic", "impratio": 10.0}
-    plant(path, columns(written), {rec.KEY: json.dumps({**text, "contact": {"time_constant": 0.005}}).encode()})
+    plant(path, written.channels, {rec.KEY: json.dumps({**text, "contact": {"time_constant": 0.005}}).encode()})
     refused(path, r"metadata\.contact\.cone")
 
 
@@ -209,15 +205,13 @@ def test_a_damaged_file_and_one_that_is_no_parquet_are_refused(path: Path) -> No
         refused(path, "not a whole Parquet file")
 
 
-def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
-    refused(tmp_path / "none.parquet", "no such file")
-    (tmp_path / "folder.parquet").mkdir()
-    refused(tmp_path / "folder.parquet", "no such file")
-
-
-@pytest.mark.parametrize("metadata", [{}, {b"other": b"{}"}])
-def test_a_parquet_file_of_something_else_is_refused(path: Path, metadata: dict[bytes, bytes]) -> None:
-    refused(plant(path, columns(arm()), metadata), "no schema metadata 'go1exp'")
+def test_a_missing_file_a_folder_and_a_parquet_file_of_something_else_are_refused(path: Path) -> None:
+    refused(path, "no such file")
+    path.mkdir()
+    refused(path, "no such file")
+    path.rmdir()
+    for metadata in ({}, {b"other": b"{}"}):
+        refused(plant(path, arm().channels, metadata), "no schema metadata 'go1exp'")
 
 
 def about(**changes: Any) -> bytes:
@@ -253,7 +247,7 @@ def about(**changes: Any) -> bytes:
     ],
 )
 def test_metadata_that_breaks_the_format_is_named(path: Path, text: bytes, match: str) -> None:
-    refused(plant(path, columns(arm()), {rec.KEY: text}), match)
+    refused(plant(path, arm().channels, {rec.KEY: text}), match)
 
 
 def test_wrong_metadata_cannot_even_be_built() -> None:
@@ -368,7 +362,7 @@ def test_a_broken_channel_is_named_on_reading_and_on_writing(path: Path, case: s
     make, match = BROKEN[case]
     with pytest.raises(RecordingError, match=match):
         rec.write(path, make())
-    refused(plant(path, columns(make())), match)
+    refused(plant(path, make().channels), match)
 
 
 def test_a_recording_in_memory_may_not_have_other_types_or_lengths(path: Path) -> None:
