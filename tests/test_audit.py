@@ -186,14 +186,6 @@ def test_a_clock_in_other_units_is_found(factor: float, unit: str) -> None:
     assert unit in report.by_check("rate")[0].message
 
 
-def stretched(factor: float, *without: str, rate: float = 200.0) -> AuditReport:
-    """The audit of a log whose clock is too slow by a factor, and whose rate_hz an import took from that clock."""
-    sound = made("multisine", rate=rate)
-    channels = {k: v for k, v in sound.channels.items() if not k.startswith((*without, "imu_"))}
-    t = sound.t * factor
-    return audit(Recording(replace(sound.meta, rate_hz=rate / factor), channels | {"t": t}))
-
-
 @pytest.mark.parametrize(
     ("factor", "without", "line"),
     [
@@ -208,7 +200,10 @@ def stretched(factor: float, *without: str, rate: float = 200.0) -> AuditReport:
 def test_a_clock_in_other_units_is_told_by_its_steps_even_if_the_rate_is_its_own(
     factor: float, without: str, line: str
 ) -> None:
-    report = stretched(factor, without)
+    sound = made("multisine", rate=200.0)
+    channels = {k: v for k, v in sound.channels.items() if not k.startswith((without, "imu_"))}
+    slow = Recording(replace(sound.meta, rate_hz=200.0 / factor), channels | {"t": sound.t * factor})
+    report = audit(slow)
     assert report.verdict == "bad"
     assert [line in f.message for f in report.by_check("rate")] == [True]
 
@@ -217,15 +212,12 @@ def test_a_slow_log_is_bad_and_not_taken_for_milliseconds_where_speeds_fit() -> 
     t = np.arange(400) * 0.25
     channels = {"t": t, "q_knee": np.sin(0.5 * t), "qd_knee": 0.5 * np.cos(0.5 * t)}
     slow = Recording(replace(META, **ARM, joints=("knee",), rate_hz=4.0), channels)
-    for recording, question in ((slow, False), (without_channels(slow, "qd_knee"), True)):
+    no_speed = replace(slow, channels={k: v for k, v in channels.items() if k != "qd_knee"})
+    for recording, question in ((slow, False), (no_speed, True)):
         report = audit(recording)
         (line,) = [f.message for f in report.by_check("rate")]
         assert (report.verdict, "Is it in milliseconds?" in line) == ("bad", question)
         assert line.startswith("steps by 0.25 s (median); a log of joints must step by at most 0.1 s")
-
-
-def without_channels(recording: Recording, *names: str) -> Recording:
-    return replace(recording, channels={k: v for k, v in recording.channels.items() if k not in names})
 
 
 def test_jitter_is_found_and_sized() -> None:

@@ -423,10 +423,6 @@ def test_a_gait_clock_and_the_command_source_are_told_the_time_since_walking_beg
     np.testing.assert_allclose([readings["walked"][0, 0] for readings in made.policy.calls], asked, atol=1e-6)
 
 
-def silent_after(cycle: int) -> Callable[[int], Sequence[LowState]]:
-    return lambda k: always(k) if k < cycle else []
-
-
 def odd_from(cycle: int, **changes: Any) -> Callable[[int], Sequence[LowState]]:
     return lambda k: [low_state(0.01 * k, **changes)] if k >= cycle else always(k)
 
@@ -435,7 +431,7 @@ def odd_from(cycle: int, **changes: Any) -> Callable[[int], Sequence[LowState]]:
     ("name", "settings"),
     [
         ("no_state", {"script": lambda k: [], "patience": 0.15}),
-        ("stale_state", {"script": silent_after(17)}),
+        ("stale_state", {"script": lambda k: always(k) if k < 17 else []}),
         ("not_finite", {"script": odd_from(20, joint_vel=at(np.zeros(12), 3, np.nan))}),
         ("tilt", {"script": odd_from(20, imu_quat=leaning(1.2))}),
         ("torque", {"script": odd_from(15, joint_torque=at(np.zeros(12), 0, 40.0))}),

@@ -94,6 +94,12 @@ def state_at(k: int) -> LowState:
     return shaking_state(k, 7.0 + 1.05 * PERIOD * k, clock=PERIOD * k, imu_acc=acc)
 
 
+def row(k: int) -> np.ndarray:
+    """The sample of the filter in that state, by the robot's own clock."""
+    s = state_at(k)
+    return sample(s.clock, s.imu_quat, s.imu_gyro, s.imu_acc, s.joint_pos, s.joint_vel, None, s.foot_force)
+
+
 def made() -> KalmanEstimator:
     def fail(name: str, message: str, t: float) -> None:
         raise AssertionError(message)
@@ -119,11 +125,6 @@ def test_overtaken_states_take_their_turn() -> None:
 
 def test_while_a_state_is_missing_the_imu_carries_the_velocity_on_and_then_the_filter_goes_on_without_it() -> None:
     estimator, oracle = made(), make_filter(go1())
-
-    def row(k: int) -> np.ndarray:
-        s = state_at(k)
-        return sample(s.clock, s.imu_quat, s.imu_gyro, s.imu_acc, s.joint_pos, s.joint_vel, None, s.foot_force)
-
     for k in range(100):
         estimator.update(state_at(k))
         oracle.update(row(k))
@@ -153,9 +154,8 @@ def test_while_a_state_is_missing_the_imu_carries_the_velocity_on_and_then_the_f
 def test_after_a_long_gap_nobody_waits() -> None:
     estimator, oracle = made(), make_filter(go1())
     for k in (*range(50), 60, 61):
-        s = state_at(k)
-        found = estimator.update(s)
-        oracle.update(sample(s.clock, s.imu_quat, s.imu_gyro, s.imu_acc, s.joint_pos, s.joint_vel, None, s.foot_force))
+        found = estimator.update(state_at(k))
+        oracle.update(row(k))
         np.testing.assert_allclose(found, oracle.velocity_b, atol=1e-12)
 
 

@@ -322,12 +322,6 @@ def spoilt(name: str, row: int, value: float) -> Recording:
     return recording
 
 
-def shuffled() -> Recording:
-    recording = arm()
-    np.random.default_rng(0).shuffle(recording.channels["t"])
-    return recording
-
-
 def turned(axis_scale: float, name: str = "imu_quat") -> Recording:
     return arm(**{f"{name}_{c}": np.full(50, axis_scale * (c == "w")) for c in "wxyz"})
 
@@ -336,10 +330,10 @@ BROKEN: dict[str, tuple[Callable[[], Recording], str]] = {
     "nan": (lambda: spoilt("q_elbow", 7, np.nan), "q_elbow: must be finite.*nan in row 7"),
     "inf": (lambda: spoilt("qd_elbow", 3, -np.inf), "qd_elbow: must be finite.*-inf in row 3"),
     "nan_time": (lambda: spoilt("t", 3, np.nan), "t: must be finite"),
-    "shuffled_time": (shuffled, "t: must increase strictly"),
+    "shuffled_time": (lambda: arm(t=np.random.default_rng(0).permutation(arm().t)), "t: must increase strictly"),
     "repeated_time": (lambda: spoilt("t", 10, 0.09), r"t: must increase strictly, but row 10 has 0.09 s after 0.09 s"),
     "milliseconds": (
-        lambda: Recording(META, {**arm().channels, "t": arm().t * 1000}),
+        lambda: arm(t=arm().t * 1000),
         "t: steps by 10 s .median., but rate_hz = 100 says 0.01 s",
     ),
     "no_time": (lambda: without(arm(), "t"), "t: required, but not given"),

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from go1exp.deploy.runtime import go1_wire
-from go1exp.deploy.runtime.loop import MonotonicClock, Timing, run
+from go1exp.deploy.runtime.loop import Timing, run
 from go1exp.deploy.runtime.safety import DEFAULT_KD
 from go1exp.deploy.runtime.udp import HOST, arrival, enable_timestamps, listening
 from go1exp.deploy.sim_robot import SimConfig
@@ -218,7 +218,6 @@ class Server:
 
     def serve(self, going: Callable[[], bool], seconds: float | None = None) -> Timing:
         """Run in real time while ``going``; return the timing."""
-        clock = MonotonicClock()
         begin, calls = math.inf, 0
 
         def work(now: float) -> bool:
@@ -236,7 +235,7 @@ class Server:
             calls += 1
             return calls % ASK_EVERY != 0 or going()
 
-        timing = run(work, 1.0 / TICK, seconds, clock)
+        timing = run(work, 1.0 / TICK, seconds)
         self.counts.timing = asdict(timing)
         return timing
 
