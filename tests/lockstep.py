@@ -144,9 +144,8 @@ def lockstep(
 
     host_time = SimpleNamespace(perf_counter=lambda: world.now, time=lambda: 0.0)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            udp, "time", host_time
-        )  # stamps of arrival are not believed, and states are as old as the last cycle
+        # Stamps of arrival are not believed, and states are as old as the last cycle.
+        patch.setattr(udp, "time", host_time)
         patch.setattr(walk, "MonotonicClock", clock)
         patch.setattr(job, "SimulatedRobot", lambda *given, **options: InProcess(world, *given, **options))
         yield world

@@ -82,9 +82,8 @@ def test_a_walk_stands_a_network_that_loses_doubles_delays_damages_and_replays(b
     link, there = done.account["link"], done.account["simulated_robot"]
     assert link["refused_because"] == {"wrong checksum": down["damaged"]}
     assert link["late"] + link["overtaken"] >= down["doubled"] + down["replayed"]
-    assert (
-        link["received"] + link["late"] <= there["states"] - down["damaged"]
-    )  # of each tick one, as the recording has
+    # of each tick one, as the recording has
+    assert link["received"] + link["late"] <= there["states"] - down["damaged"]
     assert link["lost"] > 3
     assert there["refused"] == {"wrong checksum": up["damaged"]}
     r = done.recording

@@ -150,9 +150,8 @@ def torque_off(
     enabled = np.ones(len(t), dtype=bool)
     side = np.empty(0)
     while True:
-        side = (
-            -side if len(times) % 8 == 5 else rng.choice((-1.0, 1.0), len(centre))
-        )  # every second swing is the mirror image of the one before
+        # every second swing is the mirror image of the one before
+        side = -side if len(times) % 8 == 5 else rng.choice((-1.0, 1.0), len(centre))
         pose = middle + side * half * rng.uniform(0.6, 1, len(centre))
         free = rng.uniform(*off)
         leave = times[-1] + move + settle

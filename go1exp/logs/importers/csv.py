@@ -289,9 +289,8 @@ def _problems(mapping: Mapping[str, Column], joints: tuple[str, ...], rate_hz: f
         elif column.scale == 0:
             wrong.append(f"{at}.scale = {column.scale}: must not be 0")
     for name in [f"q_{j}" for j in joints if f"q_{j}" in mapping]:
-        tail = next(
-            (j for j in joints if name.endswith(f"_{j}") and name != f"q_{j}"), ""
-        )  # q_targt_knee beside q_knee
+        # q_targt_knee beside q_knee
+        tail = next((j for j in joints if name.endswith(f"_{j}") and name != f"q_{j}"), "")
         if tail and (close := nearest(name.removesuffix(f"_{tail}"), [q for q in JOINT_QUANTITIES if "_" in q], 1)):
             return [*wrong, f"{PATH}.columns.{name}: unknown channel; did you mean '{close[0]}_{tail}'?"]
     for quantity in JOINT_QUANTITIES:

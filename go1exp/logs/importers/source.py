@@ -206,9 +206,8 @@ def load_npz(path: Path) -> Arrays:
                 raise ValueError("one bare array")
             return Arrays(path, {key: archive[key] for key in archive.files})
     except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-        reason = (
-            "no zip archive of them" if "pickle" in str(error) else error
-        )  # NumPy's message advises to allow pickles
+        # NumPy's message advises to allow pickles
+        reason = "no zip archive of them" if "pickle" in str(error) else error
         raise RecordingError(f"{path}: not a whole .npz of plain arrays ({reason})") from error
 
 
