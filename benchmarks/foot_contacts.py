@@ -26,7 +26,7 @@ from go1exp.base.paths import data_root
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import bind
 from go1exp.deploy.estimation import go1, make_filter, readings
-from go1exp.deploy.estimation.feet import FootCalibration, LoadByBoth, forces_by_torque, kinematics
+from go1exp.deploy.estimation.feet import FootCalibration, forces_by_torque, kinematics, mixed
 from go1exp.deploy.runtime.estimate import BOTH, TORQUE
 from go1exp.logs.record.simulate import Rig, Walk, play_policy
 from go1exp.logs.recording import VECTORS, Recording
@@ -95,14 +95,13 @@ def sources(rows: np.ndarray, rng: np.random.Generator) -> dict[str, Callable[[]
     """Return for each source of contact a function that gives the velocity."""
     torque = by_torque(rows)
     raw, seen = counts(rows[:, readings.FOOT_FORCE], rng)
-    both = LoadByBoth(CONFIG, seen)
-    mixed = np.array([both.mixed(one, two) for one, two in zip(raw, torque, strict=True)])
+    by_both = np.array([mixed(seen, one, two) for one, two in zip(raw, torque, strict=True)])
     return {
         "true forces": lambda: filtered(rows, None),
         "torques alone": lambda: filtered(rows, None, **TORQUE),
         "calibrated sensors": lambda: filtered(rows, (raw - seen.zero) / np.array(seen.scale)),
-        "torques and calibrated sensors": lambda: filtered(rows, mixed, **BOTH),
-        "leg odometry, smoothed, by both": lambda: odometry(rows, mixed, 0.1),
+        "torques and calibrated sensors": lambda: filtered(rows, by_both, **BOTH),
+        "leg odometry, smoothed, by both": lambda: odometry(rows, by_both, 0.1),
     }
 
 

@@ -5,9 +5,11 @@ Time passes only while the runtime sleeps, and then the robot ticks: the same ar
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,10 +17,12 @@ import numpy as np
 import pytest
 
 from go1exp.deploy.runtime import job, udp, walk
+from go1exp.deploy.runtime.commands import CommandConfig
 from go1exp.deploy.runtime.loop import Deadlines
 from go1exp.deploy.sim_robot.__main__ import bundle_task, sim_config
 from go1exp.deploy.sim_robot.machine import TICK, Robot
 from go1exp.deploy.sim_robot.server import TRUTH, Server
+from go1exp.logs import recording
 from go1exp.robot.messages import LowCmd, LowState
 
 BEGIN = 100.0
@@ -115,9 +119,9 @@ class InProcess:
         self.world.closed = True
         empty = Deadlines(TICK, 1).timing()
         self.report = asdict(self._server.counts) | {"timing": asdict(empty)}
-        self.applied = self._server.applied.rows()
-        rows = self._server.truth.rows()
-        if not np.isnan(rows).any():
+        self.applied = np.array(self._server.applied)
+        rows = np.array(self._server.truth)
+        if len(rows) and not np.isnan(rows).any():
             self.truth = dict(zip(("clock", *TRUTH), rows.T, strict=True))
         self._server.close()
 
@@ -140,9 +144,37 @@ def lockstep(
 
     host_time = SimpleNamespace(perf_counter=lambda: world.now, time=lambda: 0.0)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            udp, "time", host_time
-        )  # stamps of arrival are not believed, and states are as old as the last cycle
+        # Stamps of arrival are not believed, and states are as old as the last cycle.
+        patch.setattr(udp, "time", host_time)
         patch.setattr(walk, "MonotonicClock", clock)
         patch.setattr(job, "SimulatedRobot", lambda *given, **options: InProcess(world, *given, **options))
         yield world
+
+
+def play(
+    bundle: str,
+    out: Path,
+    spoil: Spoil = lambda state: state,
+    *,
+    on_server: Callable[[World], None] = lambda world: None,
+    about: Mapping[str, Any] | None = None,
+    **plan: Any,
+) -> SimpleNamespace:
+    """Walk in lockstep, ``about`` a job and by a plan; return status, what was said, account, log, cycles and world."""
+    usual: dict[str, Any] = {"seconds": 1.0, "stand_up": 0.2, "hand_over": 0.0, "lie_down": 0.0, "brake": 0.1}
+    plan = {**usual, "command": CommandConfig((0.4, 0.0, 0.0)), **plan}
+    said: list[str] = []
+    with lockstep(spoil, on_server) as world:
+        status = job.run_job(job.Job(bundle, "sim", walk.Plan(**plan), str(out), **(about or {})), said.append)
+    (account,) = out.glob("*.json")
+    kept = list(out.glob("*.parquet"))
+    with np.load(next(out.glob("*.npz"))) as file:
+        cycles = {name: file[name] for name in file.files}
+    return SimpleNamespace(
+        status=status,
+        output=said,
+        account=json.loads(account.read_text()),
+        recording=recording.read(kept[0]) if kept else None,
+        cycles=cycles,
+        world=world,
+    )

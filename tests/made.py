@@ -36,6 +36,14 @@ def low_state(t: float = 0.0, **changes: Any) -> LowState:
     return LowState(t, **(usual | changes))
 
 
+def shaking_state(seed: int, t: float, **changes: Any) -> LowState:
+    """Return what a robot reports that shakes about the nominal stance, with changes."""
+    rng = np.random.default_rng(seed)
+    noisy = {"joint_pos": robot.NOMINAL_STANCE + 0.01 * rng.normal(size=12), "joint_vel": rng.normal(size=12)}
+    noisy |= {"joint_torque": rng.normal(size=12), "imu_gyro": 0.1 * rng.normal(size=3)}
+    return low_state(t, **(noisy | changes))
+
+
 def low_cmd(**changes: Any) -> LowCmd:
     """Return a command that holds the nominal stance, with changes."""
     return dataclasses.replace(LowCmd(robot.NOMINAL_STANCE.copy(), np.full(12, 20.0), np.full(12, 0.5)), **changes)

@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from go1exp.logs.audit import AuditReport, audit, clock_flaws, clock_kinds, sign
 from go1exp.logs.audit.copies import copies
 from go1exp.logs.audit.impossible import impossible, without
 from go1exp.logs.audit.signals import Log
-from go1exp.logs.recording import Recording, joint_channels, write
+from go1exp.logs.recording import VECTORS, Recording, columns, joint_channels, joint_columns, write
 from go1exp.robot import EFFORT_LIMIT, JOINT_POS_LIMITS, JOINTS, NOMINAL_STANCE, per_joint, soft_limits
 from tests.made import at, real
 from tests.made import meta as made_meta
@@ -67,13 +68,17 @@ def responses(delay: float, rate: float, limit: float) -> dict[str, tuple[excita
     return {name: (motion, out[:, :, k]) for k, (name, motion) in enumerate(motions.items())}
 
 
+def by_joint(**quantities: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns of quantities (T, 12)."""
+    return {c: v for name, values in quantities.items() for c, v in joint_columns(name, JOINTS, values).items()}
+
+
 @cache
 def made(name: str = "steps", delay: float = 0.0, rate: float = RATE, limit: float = 1.0) -> Recording:
     """A sound, noise-free recording; arrays are shared, so tests copy what they change."""
     t = np.arange(round(SECONDS * rate)) / rate
     motion, (q, qd, tau) = responses(delay, rate, limit)[name]
-    joints = {"q": q, "qd": qd, "q_target": motion.target, "tau_est": tau}
-    channels = {"t": t} | {c: v for k, x in joints.items() for c, v in zip(joint_channels(k, JOINTS), x.T, strict=True)}
+    channels = {"t": t} | by_joint(q=q, qd=qd, q_target=motion.target, tau_est=tau)
     turn = Rotation.from_euler("ZYX", np.stack([a * np.sin(w * t + p) for a, w, p in ROCKING], axis=1))
     fine = Rotation.from_euler("ZYX", np.stack([a * np.sin(w * (t + 1e-6) + p) for a, w, p in ROCKING], axis=1))
     gyro = (turn.inv() * fine).as_rotvec() / 1e-6
@@ -98,12 +103,6 @@ def with_(recording: Recording, **changed: np.ndarray) -> Recording:
 def about(recording: Recording, **changes: Any) -> Recording:
     """A recording with other metadata."""
     return replace(recording, meta=replace(recording.meta, **changes))
-
-
-def by_joint(**quantities: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns of quantities (T, 12)."""
-    pairs = [(joint_channels(name, JOINTS), values.T) for name, values in quantities.items()]
-    return {c: v.copy() for names, values in pairs for c, v in zip(names, values, strict=True)}
 
 
 def rows(recording: Recording, kept: Any) -> Recording:
@@ -145,18 +144,15 @@ def size(report: AuditReport, check: str, channel: str) -> float:
 # ---------------------------------------------------------------------- no false alarms
 
 
-@pytest.mark.parametrize("name", MOTIONS)
-def test_clean_simulated_data_are_ok(name: str) -> None:
-    report = audit(made(name))
+RATES = [*((name, RATE) for name in MOTIONS), *product(("multisine", "steps", "gait"), (50.0, 200.0))]
+
+
+@pytest.mark.parametrize(("name", "rate"), RATES)
+def test_clean_simulated_data_are_ok(name: str, rate: float) -> None:
+    report = audit(made(name, rate=rate))
     assert report.flaws == []
     assert all(c.verdict == "ok" for c in report.channels)
-    assert [c.name for c in report.channels] == list(made(name).channels)
-
-
-@pytest.mark.parametrize("rate", [50.0, 200.0])
-@pytest.mark.parametrize("name", ["multisine", "steps", "gait"])
-def test_clean_slowly_sampled_data_are_ok(name: str, rate: float) -> None:
-    assert audit(made(name, rate=rate)).flaws == []
+    assert [c.name for c in report.channels] == list(made(name, rate=rate).channels)
 
 
 @pytest.mark.parametrize("name", ["chirp", "multisine", "steps", "slow_ramps", "gait", "torque_off"])
@@ -190,14 +186,6 @@ def test_a_clock_in_other_units_is_found(factor: float, unit: str) -> None:
     assert unit in report.by_check("rate")[0].message
 
 
-def stretched(factor: float, *without: str, rate: float = 200.0) -> AuditReport:
-    """The audit of a log whose clock is too slow by a factor, and whose rate_hz an import took from that clock."""
-    sound = made("multisine", rate=rate)
-    channels = {k: v for k, v in sound.channels.items() if not k.startswith((*without, "imu_"))}
-    t = sound.t * factor
-    return audit(Recording(replace(sound.meta, rate_hz=rate / factor), channels | {"t": t}))
-
-
 @pytest.mark.parametrize(
     ("factor", "without", "line"),
     [
@@ -212,7 +200,10 @@ def stretched(factor: float, *without: str, rate: float = 200.0) -> AuditReport:
 def test_a_clock_in_other_units_is_told_by_its_steps_even_if_the_rate_is_its_own(
     factor: float, without: str, line: str
 ) -> None:
-    report = stretched(factor, without)
+    sound = made("multisine", rate=200.0)
+    channels = {k: v for k, v in sound.channels.items() if not k.startswith((without, "imu_"))}
+    slow = Recording(replace(sound.meta, rate_hz=200.0 / factor), channels | {"t": sound.t * factor})
+    report = audit(slow)
     assert report.verdict == "bad"
     assert [line in f.message for f in report.by_check("rate")] == [True]
 
@@ -221,15 +212,12 @@ def test_a_slow_log_is_bad_and_not_taken_for_milliseconds_where_speeds_fit() -> 
     t = np.arange(400) * 0.25
     channels = {"t": t, "q_knee": np.sin(0.5 * t), "qd_knee": 0.5 * np.cos(0.5 * t)}
     slow = Recording(replace(META, **ARM, joints=("knee",), rate_hz=4.0), channels)
-    for recording, question in ((slow, False), (without_channels(slow, "qd_knee"), True)):
+    no_speed = replace(slow, channels={k: v for k, v in channels.items() if k != "qd_knee"})
+    for recording, question in ((slow, False), (no_speed, True)):
         report = audit(recording)
         (line,) = [f.message for f in report.by_check("rate")]
         assert (report.verdict, "Is it in milliseconds?" in line) == ("bad", question)
         assert line.startswith("steps by 0.25 s (median); a log of joints must step by at most 0.1 s")
-
-
-def without_channels(recording: Recording, *names: str) -> Recording:
-    return replace(recording, channels={k: v for k, v in recording.channels.items() if k not in names})
 
 
 def test_jitter_is_found_and_sized() -> None:
@@ -475,23 +463,26 @@ def test_a_speed_that_is_a_sample_late_is_found_on_a_slow_log(late: float) -> No
     assert size(report, "lag", "qd_FR_thigh") == pytest.approx(1e3 * late, abs=2)
 
 
-@pytest.mark.parametrize(("factor", "what"), [(1 / 9.81, "it looks like g "), (0.8, "gravity is 9.81")])
-def test_the_accelerometers_unit_is_checked(factor: float, what: str) -> None:
-    changed = {k: factor * v for k, v in made().channels.items() if k.startswith("imu_acc")}
-    report = audit(with_(made(), **changed))
+@pytest.mark.parametrize(
+    ("matrix", "check", "size", "what"),
+    [
+        (np.eye(3) / 9.81, "units", 1.0, "it looks like g "),
+        (0.8 * np.eye(3), "gravity", 0.8 * 9.81, "gravity is 9.81"),
+        (-np.eye(3), "gravity", 180.0, "sign is flipped"),
+        (np.eye(3)[::-1], "gravity", 90.0, "axes or quaternion order"),
+    ],
+    ids=["unit", "scale", "sign", "axes"],
+)
+def test_the_accelerometers_unit_sign_and_axes_are_checked(
+    matrix: np.ndarray, check: str, size: float, what: str
+) -> None:
+    names = VECTORS["imu_acc"]
+    report = audit(with_(made(), **columns(names, made().block(*names) @ matrix)))
     (flaw,) = report.flaws
-    assert (flaw.channel, flaw.verdict, flaw.size) == ("imu_acc", "bad", pytest.approx(9.81 * factor, rel=0.02))
+    assert (flaw.check, flaw.channel, flaw.verdict) == (check, "imu_acc", "bad")
+    assert flaw.size == pytest.approx(size, rel=0.02, abs=15 if size > 50 else 0)
     assert what in flaw.message
-    assert all(c.verdict == "bad" for c in report.channels if c.name.startswith("imu_acc"))
-
-
-def test_an_accelerometer_of_wrong_sign_or_axes_is_found() -> None:
-    c = made().channels
-    (flaw,) = audit(with_(made(), **{k: -v for k, v in c.items() if k.startswith("imu_acc")})).flaws
-    assert (flaw.check, flaw.channel, flaw.verdict) == ("gravity", "imu_acc", "bad")
-    assert "sign is flipped" in flaw.message
-    (flaw,) = audit(with_(made(), imu_acc_x=c["imu_acc_z"], imu_acc_z=c["imu_acc_x"])).flaws
-    assert flaw.size == pytest.approx(90, abs=15)
+    assert all(c.verdict == "bad" for c in report.channels if c.name in names)
 
 
 def test_joints_beyond_their_stops_and_torques_beyond_their_limits_are_found() -> None:
@@ -628,11 +619,6 @@ def test_where_the_delay_cannot_be_told_none_is_given() -> None:
 # ---------------------------------------------------------------------- several recordings together
 
 
-def shifted(*rows: int) -> list[Recording]:
-    """Recordings whose commands were logged so many rows late, of two motions in turn."""
-    return [about(late(("steps", "multisine")[k % 2], n), episode=f"e{k}") for k, n in enumerate(rows)]
-
-
 def late(name: str, rows: int) -> Recording:
     moved = {c: np.roll(v, rows) for c, v in made(name).channels.items() if c.startswith("q_target")}
     return with_(made(name), **moved)
@@ -667,22 +653,16 @@ def test_recordings_are_named_whose_commands_have_another_clock(
     assert all(re.match(line, text) for text in apart.values())
 
 
-def test_audit_of_a_folder_tells_of_clocks_apart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for k, recording in enumerate(shifted(0, 0, 20, 0)):
-        write(tmp_path / f"e{k}.parquet", about(recording, episode="one"))  # of one name: files tell them apart
+def test_audit_of_folders_takes_their_clocks_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As gap does; recordings of one name are told apart by their files, and each has its own figure."""
+    for k, rows in enumerate((0, 0, 20, 20)):
+        recording = about(late(("steps", "multisine")[k % 2], rows), episode="one")
+        write(tmp_path / ("day1" if k < 2 else "day2") / f"run_{k}.parquet", recording)
     out = tmp_path / "reports" / "audit.json"
-    assert AUDIT.run([f"files=[{tmp_path}]", f"out={out}"]) == 4
-    assert [Path(file).stem for file, report in json.loads(out.read_text()).items() if "clocks" in report] == ["e2"]
-    assert "e2.parquet: bad beside the others: joints answer their commands after -4" in capsys.readouterr().out
-
-
-def test_audit_of_two_folders_takes_their_clocks_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """As gap does; each file has its own figure, and folders of other rates are named with them."""
-    for k, recording in enumerate(shifted(0, 0, 20, 20)):
-        write(tmp_path / ("day1" if k < 2 else "day2") / f"run_{k % 2}.parquet", recording)
-    pair = f"files=[{tmp_path / 'day1'},{tmp_path / 'day2'}]"
-    assert AUDIT.run([pair]) == 4
-    said = [line for line in capsys.readouterr().out.splitlines() if "bad beside the others" in line]
+    assert AUDIT.run([f"files=[{tmp_path / 'day1'},{tmp_path / 'day2'}]", f"out={out}"]) == 4
+    flawed = [Path(file).stem for file, report in json.loads(out.read_text()).items() if "clocks" in report]
+    assert flawed == ["run_0", "run_1", "run_2", "run_3"]
+    said = [line for line in capsys.readouterr().out.splitlines() if ": bad beside the others: joints answer" in line]
     assert [re.findall(r"commands after (-?\d+)", line)[0] for line in said] == ["-0", "-0", "-40", "-40"]
 
 
@@ -803,8 +783,8 @@ def trotting(order: tuple[int, ...] = tuple(range(12)), flip: int | None = None)
     qd = np.gradient(q, t, axis=0)
     tau = 20.0 * (target - q) - 0.5 * qd
     sign = np.where(np.arange(12) == flip, -1.0, 1.0)
-    seen = (x[:, list(order)] for x in (sign * q, sign * qd, tau))
-    return with_(made(), **by_joint(**dict(zip(("q", "qd", "tau_est"), seen, strict=True)), q_target=target))
+    q, qd, tau = (x[:, list(order)] for x in (sign * q, sign * qd, tau))
+    return with_(made(), **by_joint(q=q, qd=qd, tau_est=tau, q_target=target))
 
 
 def test_a_joint_that_load_moves_against_its_target_has_no_flipped_sign() -> None:

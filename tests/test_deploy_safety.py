@@ -17,7 +17,7 @@ import pytest
 from go1exp import robot
 from go1exp.deploy.runtime import loop as loop_module
 from go1exp.deploy.runtime.bundle import Bundle
-from go1exp.deploy.runtime.controller import STAND_KD, STAND_KP, Controller, Cycle, Stages
+from go1exp.deploy.runtime.controller import STAND_KD, STAND_KP, Controller, Cycle, Estimator, Stages
 from go1exp.deploy.runtime.loop import Deadlines, MonotonicClock, Timing, run
 from go1exp.deploy.runtime.metadata import Port
 from go1exp.deploy.runtime.safety import RULES, Safety, SafetyConfig, sdk_range, tilt_angle
@@ -250,7 +250,7 @@ class FakePolicy:
         return {"joint_target": target, "observation": readings["joint_pos"], "action": action}
 
 
-class Velocity:
+class Velocity(Estimator):
     """An estimator that counts."""
 
     def __init__(self, fails_at: int = 10**9, how: str = "nan") -> None:
@@ -349,15 +349,6 @@ def test_the_estimator_gets_every_state_once_and_the_policy_the_newest_estimate(
     assert [readings["base_lin_vel_b"][0, 0] for readings in made.policy.calls] == [5.0 * k for k in range(11, 21)]
 
 
-def test_a_gait_clock_begins_when_walking_begins() -> None:
-    made = controller()
-    made.run_cycles(30)
-    walking = [cycle.t for cycle in made.log if cycle.phase == "walking"]
-    walked = [float(readings["walked"][0, 0]) for readings in made.policy.calls]
-    np.testing.assert_allclose(walked, np.array(walking) - walking[0], atol=1e-6)
-    assert walked[-1] > 0.1
-
-
 def test_at_another_rate_the_previous_action_is_the_mean_over_a_training_period() -> None:
     made = controller(commands=lambda t: np.array([1.0 + t, 0.0, 0.0]), rate=100.0)  # 4 cycles in a training period
     made.run_cycles(30)
@@ -422,15 +413,14 @@ def test_the_reach_of_a_target_follows_the_gains() -> None:
     assert other == alone != first
 
 
-def test_the_command_source_is_asked_for_the_time_since_walking_began() -> None:
+def test_a_gait_clock_and_the_command_source_are_told_the_time_since_walking_began() -> None:
     asked: list[float] = []
     made = controller(commands=lambda t: asked.append(t) or np.zeros(3))  # type: ignore[func-returns-value]
-    made.run_cycles(15)
-    np.testing.assert_allclose(asked, 0.01 * np.arange(5), atol=1e-9)
-
-
-def silent_after(cycle: int) -> Callable[[int], Sequence[LowState]]:
-    return lambda k: always(k) if k < cycle else []
+    made.run_cycles(30)
+    walking = [cycle.t for cycle in made.log if cycle.phase == "walking"]
+    assert walking[0] == pytest.approx(0.1)
+    np.testing.assert_allclose(asked, np.array(walking) - walking[0], atol=1e-9)
+    np.testing.assert_allclose([readings["walked"][0, 0] for readings in made.policy.calls], asked, atol=1e-6)
 
 
 def odd_from(cycle: int, **changes: Any) -> Callable[[int], Sequence[LowState]]:
@@ -441,7 +431,7 @@ def odd_from(cycle: int, **changes: Any) -> Callable[[int], Sequence[LowState]]:
     ("name", "settings"),
     [
         ("no_state", {"script": lambda k: [], "patience": 0.15}),
-        ("stale_state", {"script": silent_after(17)}),
+        ("stale_state", {"script": lambda k: always(k) if k < 17 else []}),
         ("not_finite", {"script": odd_from(20, joint_vel=at(np.zeros(12), 3, np.nan))}),
         ("tilt", {"script": odd_from(20, imu_quat=leaning(1.2))}),
         ("torque", {"script": odd_from(15, joint_torque=at(np.zeros(12), 0, 40.0))}),
@@ -518,7 +508,7 @@ def test_gains_that_nobody_knows_have_to_be_given() -> None:
 # ---------------------------------------------------------------------- the loop
 
 
-class FakeClock:
+class FakeClock(MonotonicClock):
     """Time that passes only while somebody works or sleeps; a sleeper wakes ``late`` s after the time."""
 
     def __init__(self, late: Callable[[int], float] = lambda sleep: 0.0) -> None:

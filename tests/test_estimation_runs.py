@@ -67,19 +67,6 @@ def test_the_accelerometer_is_turned_back_to_specific_force() -> None:
     assert "no specific force" in logged.meta.notes
 
 
-def test_it_is_what_the_feet_carry() -> None:
-    """The same without motion capture: the feet's forces, summed, over the robot's mass."""
-    for number in (15, 17, 23):
-        arrays = run(number)
-        (r,) = import_recordings("scaler_walk_mocap", DATA / f"run_{number}.npz", {})
-        walking = (r.t > 1.0) & (r.t < 6.5)
-        smooth = np.ones(9) / 9
-        force = np.minimum(np.linalg.norm(arrays["foot_wrench_raw"][:, :, :3], axis=2), 200.0).sum(axis=1)
-        carried = np.convolve(force, smooth, "same")[walking]
-        felt = np.convolve(r.block("imu_acc_z")[:, 0], smooth, "same")[walking]
-        assert np.corrcoef(carried, felt)[0, 1] > 0.75
-
-
 @pytest.mark.slow("go1exp/deploy/estimation/", "go1exp/evaluate/agents.py", "assets/estimation/", "hatch_build.py")
 @pytest.mark.parametrize("number", [14, 15])
 def test_motion_capture_a_stride_off_is_moved_back(number: int, tmp_path: Path) -> None:

@@ -1028,7 +1028,7 @@ def sim_trace(container: dict[str, Any], walk: Walk) -> Trace:
                 with suppress(BlockingIOError):
                     while True:
                         seen.append([k, client.recv(2000)])
-        seen.insert(1, server.truth.rows())
+        seen.insert(1, np.array(server.truth))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(alone, "serve", lived)

@@ -6,12 +6,15 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import torch
 from scipy import signal
 
 from go1exp import robot
 from go1exp.config.schema import registry
 from go1exp.logs import excitations
+from go1exp.logs.audit.signals import stretches
 from go1exp.logs.excitations import ExcitationError, Motion
+from go1exp.mdp.kinematics import foot_positions
 
 RATE = 500.0
 MEMBERS = registry.members("excitation")
@@ -31,11 +34,6 @@ def power(target: np.ndarray, low: float, high: float) -> np.ndarray:
     """Mean power of each joint's angle in a band, rad2/Hz."""
     frequency, density = signal.periodogram(target - target.mean(axis=0), RATE, axis=0)
     return density[(frequency >= low) & (frequency < high)].mean(axis=0)
-
-
-def stretches(flags: np.ndarray) -> list[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
-    return list(zip(edges[::2], edges[1::2], strict=True))
 
 
 # ---------------------------------------------------------------------- the contract
@@ -288,17 +286,6 @@ def test_drops_hold_the_stance_and_differ_in_height() -> None:
 def test_legs_of_the_go1_keep_their_distance(name: str) -> None:
     """Feet of one side stay apart lengthwise, feet of a pair sideways (the foot's radius is 23 mm)."""
     for seed in range(3):
-        foot = _feet(go1(name, seed).target)
+        foot = foot_positions(torch.as_tensor(go1(name, seed).target)).numpy()
         assert (foot[:, [0, 1], 0] - foot[:, [2, 3], 0]).min() > 0.06
         assert (foot[:, [1, 3], 1] - foot[:, [0, 2], 1]).min() > 0.06
-
-
-def _feet(q: np.ndarray) -> np.ndarray:
-    """Foot positions (T, 4, 3) in the trunk frame, m; closed form of the vendor's kinematics."""
-    a, b, c = np.moveaxis(q.reshape(-1, 4, 3), 2, 0)
-    side, front = np.array([-1, 1, -1, 1]), np.array([1, 1, -1, -1])
-    d, upper, lower = robot.LINK_LENGTHS
-    h, w = -upper * np.cos(b) - lower * np.cos(b + c), side * d
-    x = front * robot.HIP_OFFSET[0] - upper * np.sin(b) - lower * np.sin(b + c)
-    y = side * robot.HIP_OFFSET[1] + w * np.cos(a) - h * np.sin(a)
-    return np.stack([x, y, w * np.sin(a) + h * np.cos(a)], axis=2)

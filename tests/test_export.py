@@ -521,7 +521,8 @@ def test_the_runtime_does_on_the_traces_readings_what_the_environment_did(good: 
     link = FakeLink(lambda k: [states[k]])
     sent = link.sent
     commands = lambda t: trace["input.command"][len(sent)]  # noqa: E731
-    estimator = SimpleNamespace(update=lambda state: None, ahead=lambda age: trace["input.base_lin_vel_b"][len(sent)])
+    estimates = trace["input.base_lin_vel_b"]
+    estimator: Any = SimpleNamespace(update=lambda state: None, ahead=lambda age: estimates[len(sent)])
     safety = Safety(robot.JOINTS, robot.JOINT_POS_LIMITS, np.array(good.metadata.torque_limit))
     gains: dict[str, Any] = {"kp": np.array(good.metadata.kp), "kd": np.array(good.metadata.kd)}
     about: dict[str, Any] = {"stages": Stages(stand_up=0.0), "on_cycle": observed.append, **gains}

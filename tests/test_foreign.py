@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -19,12 +18,9 @@ from go1exp.deploy.export.foreign import ORDERS, PRESETS, Front, Spec, config_of
 from go1exp.deploy.export.foreign_graph import Network
 from go1exp.deploy.export.graph import ExportError
 from go1exp.deploy.runtime.bundle import load
-from go1exp.deploy.runtime.commands import CommandConfig
-from go1exp.deploy.runtime.job import Job, run_job
-from go1exp.deploy.runtime.walk import Plan
 from go1exp.train import run_folder
 from go1exp.train.policy import load_network
-from tests.lockstep import lockstep
+from tests.lockstep import play
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
 
@@ -101,11 +97,9 @@ def test_a_network_in_their_convention_acts_as_the_original_and_is_deployed(pres
     got = made({name: values.numpy() for name, values in given.items()})
     np.testing.assert_allclose(got["action"], wanted, rtol=0, atol=1e-4)
     np.testing.assert_allclose(got["joint_target"], robot.NOMINAL_STANCE + 0.2 * wanted.numpy(), rtol=0, atol=1e-4)
-    plan = Plan(seconds=1.0, stand_up=0.2, hand_over=0.0, lie_down=0.0, brake=0.1, command=CommandConfig((0.4, 0, 0)))
-    with lockstep():
-        assert run_job(Job(str(file), "sim", plan, str(tmp_path / "walk"), truth=True), lines.append) == 0
-    (account,) = (tmp_path / "walk").glob("*.json")
-    x, y, yaw = json.loads(account.read_text())["velocity"]["mean"]
+    done = play(str(file), tmp_path / "walk", about={"truth": True})
+    assert done.status == 0
+    x, y, yaw = done.account["velocity"]["mean"]
     assert (x, y, yaw) == (pytest.approx(0.4, abs=0.05), pytest.approx(0, abs=0.05), pytest.approx(0, abs=0.1))
 
 
@@ -224,6 +218,21 @@ def test_a_policy_of_mjlab_stated_as_one_of_isaaclab_is_named(tmp_path: Path) ->
         build_foreign(file, contract(tmp_path, "isaaclab"))
 
 
+def network(file: Path, size: int, kinds: tuple[int, int], shapes: tuple[list[int], list[int]]) -> Path:
+    """Write a graph without any effect, whose input and output have these types of numbers and shapes."""
+    helper = onnx.helper
+    weights = onnx.numpy_helper.from_array(np.zeros((size, 12), np.float32), "W")
+    nodes = [
+        helper.make_node("Cast", ["obs"], ["x"], to=1),
+        helper.make_node("MatMul", ["x", "W"], ["y"]),
+        helper.make_node("Cast", ["y"], ["actions"], to=kinds[1]),
+    ]
+    ports = [helper.make_tensor_value_info(*p) for p in zip(("obs", "actions"), kinds, shapes, strict=True)]
+    graph = helper.make_graph(nodes, "p", ports[:1], ports[1:], [weights])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), file)
+    return file
+
+
 def test_metadata_of_the_file_and_sizes(tmp_path: Path) -> None:
     props = {
         "joint_names": ",".join(f"{n}_joint" for n in ORDERS["leg_major"]),
@@ -236,12 +245,7 @@ def test_metadata_of_the_file_and_sizes(tmp_path: Path) -> None:
     assert [o.term for o in spec.observation] == ["base_ang_vel", "joint_pos", "actions"]
     assert spec.joints("kp").tolist() == list(range(12))
     assert "joint_order" in notes[0]
-    made = tmp_path / "p.onnx"
-    node = onnx.helper.make_node("MatMul", ["obs", "W"], ["actions"])
-    weights = onnx.numpy_helper.from_array(np.zeros((45, 12), np.float32), "W")
-    ports = [onnx.helper.make_tensor_value_info(n, 1, [1, s]) for n, s in (("obs", 45), ("actions", 12))]
-    graph = onnx.helper.make_graph([node], "p", ports[:1], ports[1:], [weights])
-    onnx.save(onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8), made)
+    made = network(tmp_path / "p.onnx", 45, (1, 1), ([1, 45], [1, 12]))
     with pytest.raises(ConfigError, match=r"48 numbers .*the network takes 45"):
         build_foreign(made, "legged_gym")
     assert {name.partition(":")[0] for name, _ in alternatives(spec_of("isaaclab", {})[0])} >= {"joint order", "sign"}
@@ -258,17 +262,7 @@ def test_metadata_of_the_file_and_sizes(tmp_path: Path) -> None:
 def test_numbers_of_a_network_that_the_runtime_does_not_feed_are_named(
     kinds: tuple[int, int], shapes: tuple[list[int], list[int]], named: str, tmp_path: Path
 ) -> None:
-    helper = onnx.helper
-    weights = onnx.numpy_helper.from_array(np.zeros((48, 12), np.float32), "W")
-    nodes = [
-        helper.make_node("Cast", ["obs"], ["x"], to=1),
-        helper.make_node("MatMul", ["x", "W"], ["y"]),
-        helper.make_node("Cast", ["y"], ["actions"], to=kinds[1]),
-    ]
-    ports = [helper.make_tensor_value_info(*p) for p in zip(("obs", "actions"), kinds, shapes, strict=True)]
-    graph = helper.make_graph(nodes, "p", ports[:1], ports[1:], [weights])
-    file = tmp_path / "p.onnx"
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), file)
+    file = network(tmp_path / "p.onnx", 48, kinds, shapes)
     with pytest.raises(ExportError, match=named):
         build_foreign(file, "isaaclab")
 

@@ -6,9 +6,8 @@ import json
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -40,24 +39,8 @@ from go1exp.deploy.sim_robot.server import GONE_S, STRANGER, TRUTH, FootSensors,
 from go1exp.logs import recording
 from go1exp.robot.go1_fields import STATE_SIZE
 from go1exp.robot.messages import LowState
-from tests.lockstep import World, lockstep
+from tests.lockstep import World, lockstep, play
 from tests.made import at, low_cmd, low_state
-
-
-def play(bundle: str, out: Path, meddle: Callable[[World], None] = lambda world: None, **sim: Any) -> SimpleNamespace:
-    """Walk for a second by the robot's packets; ``meddle`` is called when the simulated robot is there."""
-    plan = Plan(seconds=1.0, stand_up=0.2, lie_down=0.0, brake=0.1, command=CommandConfig((0.4, 0.0, 0.0)))
-    output: list[str] = []
-    with lockstep(on_server=meddle) as world:
-        status = run_job(Job(bundle, "sim", plan, str(out), sim=sim, truth=True), output.append)
-    account = json.loads(next(out.glob("*.json")).read_text())
-    return SimpleNamespace(
-        status=status,
-        output=output,
-        account=account,
-        recording=recording.read(next(out.glob("*.parquet"))),
-        world=world,
-    )
 
 
 class Spoilt(Network):
@@ -91,7 +74,7 @@ def test_a_walk_stands_a_network_that_loses_doubles_delays_damages_and_replays(b
         ways[:] = Spoilt(1), Spoilt(2)
         world.server._uplink, world.server._downlink = ways
 
-    done = play(bundle, tmp_path, spoil)
+    done = play(bundle, tmp_path, on_server=spoil, about={"truth": True}, hand_over=0.5)
     assert done.status == 0
     assert done.output[-1] == "walked for 1.0 s, to the end"
     up, down = (way.done for way in ways)
@@ -99,9 +82,8 @@ def test_a_walk_stands_a_network_that_loses_doubles_delays_damages_and_replays(b
     link, there = done.account["link"], done.account["simulated_robot"]
     assert link["refused_because"] == {"wrong checksum": down["damaged"]}
     assert link["late"] + link["overtaken"] >= down["doubled"] + down["replayed"]
-    assert (
-        link["received"] + link["late"] <= there["states"] - down["damaged"]
-    )  # of each tick one, as the recording has
+    # of each tick one, as the recording has
+    assert link["received"] + link["late"] <= there["states"] - down["damaged"]
     assert link["lost"] > 3
     assert there["refused"] == {"wrong checksum": up["damaged"]}
     r = done.recording
@@ -143,19 +125,9 @@ def errors(states: list[LowState], truth: dict[str, np.ndarray], estimator: Kalm
     return float(np.sqrt((off[250:] ** 2).sum(axis=1).mean()))
 
 
-@dataclass
-class Watched:
-    """A walk whose filter was watched."""
-
-    states: list[LowState]
-    velocity: np.ndarray
-    truth: dict[str, np.ndarray]
-    said: list[str]
-
-
 def watched(
     walking: str, out: Path, monkeypatch: pytest.MonkeyPatch, feet: str | None, seconds: float = 3.0
-) -> Watched:
+) -> SimpleNamespace:
     """Walk with the shipped policy and raw sensors for some seconds, and keep what its filter took and gave."""
     states, velocities, said, worlds = list[LowState](), list[np.ndarray](), list[str](), list[World]()
     update = KalmanEstimator.update
@@ -170,9 +142,9 @@ def watched(
         patch.setattr(KalmanEstimator, "update", listening)
         assert run_job(Job(walking, "sim", plan, str(out), sim=RAW, feet=feet), said.append) == 0, said
         assert world.server is not None
-        rows = world.server.truth.rows()
+        rows = np.array(world.server.truth)
     truth = dict(zip(("clock", *TRUTH), rows.T, strict=True))
-    return Watched(states, np.array(velocities), truth, said)
+    return SimpleNamespace(states=states, velocity=np.array(velocities), truth=truth, said=said)
 
 
 def test_raw_sensors_with_a_calibration_and_torques_tell_contact_better_than_torques_alone_or_counts(
@@ -212,25 +184,28 @@ def test_raw_sensors_without_a_calibration_leave_contact_to_the_torques(
     )
 
 
-@pytest.mark.parametrize("sim", [{}, {"feet": "newton"}])
-def test_a_calibration_of_sensors_that_say_newtons_is_refused(bundle: str, tmp_path: Path, sim: dict[str, str]) -> None:
-    job = Job(bundle, "sim", Plan(seconds=1.0), str(tmp_path / "out"), sim=sim, feet=of_sensors(0, tmp_path))
-    with pytest.raises(RobotError, match=r"feet\.json: calibrates sensors that report counts.*unless sim\.feet=raw"):
-        run_job(job, print)
+@pytest.mark.parametrize(
+    ("sim", "scaled", "message"),
+    [
+        ({}, True, r"feet\.json: calibrates sensors that report counts.*unless sim\.feet=raw"),
+        ({"feet": "newton"}, True, r"feet\.json: calibrates sensors that report counts.*unless sim\.feet=raw"),
+        ({"feet": "raw"}, False, "has no scales"),
+    ],
+)
+def test_a_calibration_that_does_not_fit_is_refused_before_anything_moves(
+    bundle: str, tmp_path: Path, sim: dict[str, str], scaled: bool, message: str
+) -> None:
+    feet = of_sensors(0, tmp_path)
+    if not scaled:
+        FootCalibration((1.0, 2.0, 3.0, 4.0)).write(Path(feet))
+    with pytest.raises((RobotError, CalibrationError), match=message):
+        run_job(Job(bundle, "sim", Plan(seconds=1.0), str(tmp_path / "out"), sim=sim, feet=feet), print)
     assert not (tmp_path / "out").exists()
-
-
-def test_a_calibration_without_scales_is_refused_before_anything_moves(bundle: str, tmp_path: Path) -> None:
-    FootCalibration((1.0, 2.0, 3.0, 4.0)).write(tmp_path / "feet.json")
-    job = Job(bundle, "sim", Plan(), str(tmp_path / "o"), sim={"feet": "raw"}, feet=str(tmp_path / "feet.json"))
-    with pytest.raises(CalibrationError, match="has no scales"):
-        run_job(job, print)
-    assert not (tmp_path / "o").exists()
 
 
 def server(bundle: str, **sim: Any) -> Server:
     config = sim_config({"noise": 0.0, **sim})
-    return Server(Robot(bundle_task(bundle, {}), config), config)
+    return Server(Robot(bundle_task(bundle, {}), config), config, kept=0.1)
 
 
 @contextmanager
@@ -277,6 +252,8 @@ def test_a_robot_holds_its_pose_until_a_command_and_brakes_when_nobody_speaks(bu
         for _ in range(200):
             client.sendto(wire.IDLE, to)
             made.tick()
+        assert len(made.truth) == len(made.applied) == 51  # the newest 0.1 s
+        assert made.truth[-1][0] == made.applied[-1][0] == pytest.approx(made.robot.clock - TICK)
         assert made.robot.truth[2] > 0.25  # it stands, as by its maker's own controller
         client.sendto(wire.pack_command(low_cmd()), to)
         made.tick()

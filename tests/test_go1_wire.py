@@ -7,7 +7,7 @@ import re
 import socket
 import struct
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, cast
 
@@ -87,12 +87,8 @@ def slow_checksum(packet: bytes) -> int:
 # ---------------------------------------------------------------------- bytes
 
 
-def test_an_idle_command_is_the_vendors_byte_by_byte() -> None:
-    assert wire.IDLE == VENDOR_IDLE
-
-
-def test_a_command_is_the_vendors_byte_by_byte() -> None:
-    assert wire.pack_command(command()) == VENDOR_COMMAND
+def test_commands_are_the_vendors_byte_by_byte() -> None:
+    assert (wire.IDLE, wire.pack_command(command())) == (VENDOR_IDLE, VENDOR_COMMAND)
 
 
 def test_the_checksum_is_that_of_the_vendor_and_of_its_definition() -> None:
@@ -254,38 +250,36 @@ def test_stop_values_switch_feedback_off() -> None:
 # ---------------------------------------------------------------------- refusals
 
 
-@pytest.mark.parametrize(
-    ("packet", "why"),
-    [
-        (VENDOR_COMMAND[:-1], wire.Refusal.SIZE),
-        (VENDOR_COMMAND + b"\0", wire.Refusal.SIZE),
-        (b"", wire.Refusal.SIZE),
-        (GOOD, wire.Refusal.SIZE),
-        (b"\xfe\xee" + VENDOR_COMMAND[2:], wire.Refusal.HEAD),
-        (VENDOR_COMMAND[:2] + b"\xee" + VENDOR_COMMAND[3:], wire.Refusal.LEVEL),
-        (VENDOR_COMMAND[:-1] + b"\0", wire.Refusal.CHECKSUM),
-        (VENDOR_COMMAND[:300] + b"\1" + VENDOR_COMMAND[301:], wire.Refusal.CHECKSUM),
-        (resealed(VENDOR_COMMAND, 23, struct.pack("<f", math.nan)), wire.Refusal.CONTENT),
-        (resealed(VENDOR_COMMAND, 27, struct.pack("<f", math.inf)), wire.Refusal.CONTENT),
-        (resealed(VENDOR_COMMAND, 23, b"\1\0\x80\x7f"), wire.Refusal.CONTENT),  # a signalling NaN
-        (resealed(VENDOR_COMMAND, 23, struct.pack("<f", 1e6)), wire.Refusal.CONTENT),
-        (resealed(VENDOR_COMMAND, 22, b"\7"), wire.Refusal.CONTENT),
-    ],
-)
-def test_a_packet_that_is_wrong_is_refused_by_name(packet: bytes, why: wire.Refusal) -> None:
-    assert wire.unpack_command(packet) is why
+WRONG_COMMANDS = [
+    *((packet, "SIZE") for packet in (VENDOR_COMMAND[:-1], VENDOR_COMMAND + b"\0", b"", GOOD)),
+    (b"\xfe\xee" + VENDOR_COMMAND[2:], "HEAD"),
+    (VENDOR_COMMAND[:2] + b"\xee" + VENDOR_COMMAND[3:], "LEVEL"),
+    (VENDOR_COMMAND[:-1] + b"\0", "CHECKSUM"),
+    (VENDOR_COMMAND[:300] + b"\1" + VENDOR_COMMAND[301:], "CHECKSUM"),
+    (resealed(VENDOR_COMMAND, 23, struct.pack("<f", math.nan)), "CONTENT"),
+    (resealed(VENDOR_COMMAND, 27, struct.pack("<f", math.inf)), "CONTENT"),
+    (resealed(VENDOR_COMMAND, 23, b"\1\0\x80\x7f"), "CONTENT"),  # a signalling NaN
+    (resealed(VENDOR_COMMAND, 23, struct.pack("<f", 1e6)), "CONTENT"),
+    (resealed(VENDOR_COMMAND, 22, b"\7"), "CONTENT"),
+]
+PLACES = (22, 22 + 16, 22 + 28, 75 + 1, 75 + 11 * 32 + 5)
+WRONG_STATES = [
+    *((packet, "SIZE") for packet in (GOOD[:-1], VENDOR_COMMAND)),
+    (b"x" + GOOD[1:], "HEAD"),
+    (GOOD[:2] + b"\xee" + GOOD[3:], "LEVEL"),
+    (GOOD[:100] + b"\7" + GOOD[101:], "CHECKSUM"),
+    *((resealed(GOOD, k, struct.pack("<f", x)), "CONTENT") for k in PLACES for x in (math.nan, math.inf, -1e10)),
+]
 
 
-def test_a_state_is_refused_likewise() -> None:
-    wrong = {
-        GOOD[:-1]: "SIZE",
-        VENDOR_COMMAND: "SIZE",
-        b"x" + GOOD[1:]: "HEAD",
-        GOOD[:100] + b"\7" + GOOD[101:]: "CHECKSUM",
-    }
-    wrong[GOOD[:2] + b"\xee" + GOOD[3:]] = "LEVEL"
-    assert [wire.refusal(packet, 807) for packet in wrong] == [wire.Refusal[why] for why in wrong.values()]
-    assert wire.refusal(GOOD, 807) is None
+WRONG: list[tuple[Callable[[bytes], Any], bytes, str]] = [(wire.unpack_command, *case) for case in WRONG_COMMANDS]
+WRONG += [(wire.state_refusal, *case) for case in WRONG_STATES]
+
+
+@pytest.mark.parametrize(("read", "packet", "why"), WRONG)
+def test_a_packet_that_is_wrong_is_refused_by_name(read: Callable[[bytes], Any], packet: bytes, why: str) -> None:
+    assert read(packet) is wire.Refusal[why]
+    assert wire.state_refusal(GOOD) is None
 
 
 LISTENER = Packets(SimConfig())
@@ -401,7 +395,7 @@ def looking() -> Iterator[Linked]:
 def meet_state(end: End, packet: bytes, whole: bool) -> None:
     """Send a packet to the runtime; what it reads is finite, and of what is not whole it believes nothing."""
     link, other, to = end
-    link._last, before = None, link.traffic.foreign  # no tick is late
+    link.tick, before = None, link.traffic.foreign  # no tick is late
     other.sendto(packet, to)
     with np.errstate(all="raise"):
         states = link.receive()
@@ -454,14 +448,6 @@ def test_what_is_not_mutated_is_obeyed_and_believed(listening: End, looking: End
     received = looking[0].traffic.received
     meet_state(looking, GOOD, True)
     assert looking[0].traffic.received == received + 1
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf, -1e10])
-@pytest.mark.parametrize("place", [22, 22 + 16, 22 + 28, 75 + 1, 75 + 11 * 32 + 5])
-def test_a_state_with_a_reading_that_cannot_be_is_refused_by_name(place: int, value: float) -> None:
-    packet = resealed(GOOD, place, struct.pack("<f", value))
-    assert wire.state_refusal(packet) is wire.Refusal.CONTENT
-    assert wire.state_refusal(GOOD) is None
 
 
 # ---------------------------------------------------------------------- the link

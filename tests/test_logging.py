@@ -171,30 +171,21 @@ def events_of(run: Path) -> Any:
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_tensorboard_reads_back_what_was_logged(tmp_path: Path) -> None:
-    logger = make_logger(LoggerConfig(csv=False, tensorboard=True, wandb=None), tmp_path, 0, {})
-    for iteration in (1, 2, 3):
-        logger.record("train/kl", 0.25 * iteration)
-        logger.record("reward/gait", -1.5)
-        logger.dump(step=64 * iteration)
-    logger.close()
-    events = events_of(tmp_path)
-    assert set(events.Tags()["scalars"]) == {"train/kl", "reward/gait"}
-    assert [(e.step, e.value) for e in events.Scalars("train/kl")] == [(64, 0.25), (128, 0.5), (192, 0.75)]
-    assert [e.value for e in events.Scalars("reward/gait")] == [-1.5] * 3
-    assert not (tmp_path / "metrics.csv").exists()
-
-
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_tensorboard_hides_the_rows_beyond_the_checkpoint_that_a_run_went_on_from(tmp_path: Path) -> None:
+def test_tensorboard_reads_back_what_was_logged_but_beyond_the_checkpoint_that_a_run_went_on_from(
+    tmp_path: Path,
+) -> None:
     config = LoggerConfig(csv=False, tensorboard=True, wandb=None)
     for first, last, value in ((1, 3, 0.25), (3, 4, 0.5)):
         logger = make_logger(config, tmp_path, first - 1, {}, steps=64 * (first - 1))
         for iteration in range(first, last + 1):
             logger.record("train/kl", value)
+            logger.record("reward/gait", -1.5)
             logger.dump(step=64 * iteration)
         logger.close()
     events = events_of(tmp_path)
+    assert set(events.Tags()["scalars"]) == {"train/kl", "reward/gait"}
+    assert [e.value for e in events.Scalars("reward/gait")] == [-1.5] * 4
+    assert not (tmp_path / "metrics.csv").exists()
     assert [(e.step, e.value) for e in events.Scalars("train/kl")] == [(64, 0.25), (128, 0.25), (192, 0.5), (256, 0.5)]
 
 

@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from go1exp import robot
 from go1exp.deploy.estimation import Status, go1, make_filter, sample
 from go1exp.deploy.runtime.estimate import LONGEST_AHEAD, KalmanEstimator, acceleration
 from go1exp.deploy.runtime.report import summary_lines
 from go1exp.deploy.runtime.udp import MOST_SLIP, WINDOW_S, PacketDelay, delays, slip, spread
 from go1exp.robot.go1_fields import PERIOD
 from go1exp.robot.messages import OVERTAKEN_S, LowState
-from tests.made import low_state
+from tests.made import shaking_state
 
 
 def test_delays_are_those_beyond_the_fastest_of_the_last_second() -> None:
@@ -90,11 +89,15 @@ def test_the_change_of_the_velocity_is_that_of_a_body_that_turns_and_is_pushed()
 
 
 def state_at(k: int) -> LowState:
-    rng = np.random.default_rng(k)
-    noisy = {"joint_pos": robot.NOMINAL_STANCE + 0.01 * rng.normal(size=12), "joint_vel": rng.normal(size=12)}
-    noisy |= {"joint_torque": rng.normal(size=12), "imu_gyro": 0.1 * rng.normal(size=3)}
-    acc = np.array([0.5, -0.3, 9.81]) + rng.normal(size=3)
-    return low_state(7.0 + PERIOD * k, clock=PERIOD * k, imu_acc=acc, **noisy)
+    """A state that arrives by another clock than the robot's own."""
+    acc = np.array([0.5, -0.3, 9.81]) + np.random.default_rng(1000 + k).normal(size=3)
+    return shaking_state(k, 7.0 + 1.05 * PERIOD * k, clock=PERIOD * k, imu_acc=acc)
+
+
+def row(k: int) -> np.ndarray:
+    """The sample of the filter in that state, by the robot's own clock."""
+    s = state_at(k)
+    return sample(s.clock, s.imu_quat, s.imu_gyro, s.imu_acc, s.joint_pos, s.joint_vel, None, s.foot_force)
 
 
 def made() -> KalmanEstimator:
@@ -122,11 +125,6 @@ def test_overtaken_states_take_their_turn() -> None:
 
 def test_while_a_state_is_missing_the_imu_carries_the_velocity_on_and_then_the_filter_goes_on_without_it() -> None:
     estimator, oracle = made(), make_filter(go1())
-
-    def row(k: int) -> np.ndarray:
-        s = state_at(k)
-        return sample(s.clock, s.imu_quat, s.imu_gyro, s.imu_acc, s.joint_pos, s.joint_vel, None, s.foot_force)
-
     for k in range(100):
         estimator.update(state_at(k))
         oracle.update(row(k))
@@ -156,9 +154,8 @@ def test_while_a_state_is_missing_the_imu_carries_the_velocity_on_and_then_the_f
 def test_after_a_long_gap_nobody_waits() -> None:
     estimator, oracle = made(), make_filter(go1())
     for k in (*range(50), 60, 61):
-        s = state_at(k)
-        found = estimator.update(s)
-        oracle.update(sample(s.clock, s.imu_quat, s.imu_gyro, s.imu_acc, s.joint_pos, s.joint_vel, None, s.foot_force))
+        found = estimator.update(state_at(k))
+        oracle.update(row(k))
         np.testing.assert_allclose(found, oracle.velocity_b, atol=1e-12)
 
 

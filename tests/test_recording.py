@@ -62,10 +62,6 @@ def plant(path: Path, columns: dict[str, Any], metadata: dict[bytes, bytes] | No
     return path
 
 
-def columns(recording: Recording) -> dict[str, np.ndarray]:
-    return dict(recording.channels)
-
-
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     return tmp_path / "episode.parquet"
@@ -134,7 +130,7 @@ def test_the_contact_of_the_model_comes_back_and_files_without_one_have_none(pat
     assert same(rec.read(path), written)
     text = json.loads(pq.read_schema(path).metadata[rec.KEY])
     assert text["contact"] == {"time_constant": 0.005, "cone": "elliptic", "impratio": 10.0}
-    plant(path, columns(written), {rec.KEY: json.dumps({**text, "contact": {"time_constant": 0.005}}).encode()})
+    plant(path, written.channels, {rec.KEY: json.dumps({**text, "contact": {"time_constant": 0.005}}).encode()})
     refused(path, r"metadata\.contact\.cone")
 
 
@@ -209,15 +205,13 @@ def test_a_damaged_file_and_one_that_is_no_parquet_are_refused(path: Path) -> No
         refused(path, "not a whole Parquet file")
 
 
-def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
-    refused(tmp_path / "none.parquet", "no such file")
-    (tmp_path / "folder.parquet").mkdir()
-    refused(tmp_path / "folder.parquet", "no such file")
-
-
-@pytest.mark.parametrize("metadata", [{}, {b"other": b"{}"}])
-def test_a_parquet_file_of_something_else_is_refused(path: Path, metadata: dict[bytes, bytes]) -> None:
-    refused(plant(path, columns(arm()), metadata), "no schema metadata 'go1exp'")
+def test_a_missing_file_a_folder_and_a_parquet_file_of_something_else_are_refused(path: Path) -> None:
+    refused(path, "no such file")
+    path.mkdir()
+    refused(path, "no such file")
+    path.rmdir()
+    for metadata in ({}, {b"other": b"{}"}):
+        refused(plant(path, arm().channels, metadata), "no schema metadata 'go1exp'")
 
 
 def about(**changes: Any) -> bytes:
@@ -253,7 +247,7 @@ def about(**changes: Any) -> bytes:
     ],
 )
 def test_metadata_that_breaks_the_format_is_named(path: Path, text: bytes, match: str) -> None:
-    refused(plant(path, columns(arm()), {rec.KEY: text}), match)
+    refused(plant(path, arm().channels, {rec.KEY: text}), match)
 
 
 def test_wrong_metadata_cannot_even_be_built() -> None:
@@ -328,12 +322,6 @@ def spoilt(name: str, row: int, value: float) -> Recording:
     return recording
 
 
-def shuffled() -> Recording:
-    recording = arm()
-    np.random.default_rng(0).shuffle(recording.channels["t"])
-    return recording
-
-
 def turned(axis_scale: float, name: str = "imu_quat") -> Recording:
     return arm(**{f"{name}_{c}": np.full(50, axis_scale * (c == "w")) for c in "wxyz"})
 
@@ -342,10 +330,10 @@ BROKEN: dict[str, tuple[Callable[[], Recording], str]] = {
     "nan": (lambda: spoilt("q_elbow", 7, np.nan), "q_elbow: must be finite.*nan in row 7"),
     "inf": (lambda: spoilt("qd_elbow", 3, -np.inf), "qd_elbow: must be finite.*-inf in row 3"),
     "nan_time": (lambda: spoilt("t", 3, np.nan), "t: must be finite"),
-    "shuffled_time": (shuffled, "t: must increase strictly"),
+    "shuffled_time": (lambda: arm(t=np.random.default_rng(0).permutation(arm().t)), "t: must increase strictly"),
     "repeated_time": (lambda: spoilt("t", 10, 0.09), r"t: must increase strictly, but row 10 has 0.09 s after 0.09 s"),
     "milliseconds": (
-        lambda: Recording(META, {**arm().channels, "t": arm().t * 1000}),
+        lambda: arm(t=arm().t * 1000),
         "t: steps by 10 s .median., but rate_hz = 100 says 0.01 s",
     ),
     "no_time": (lambda: without(arm(), "t"), "t: required, but not given"),
@@ -368,7 +356,7 @@ def test_a_broken_channel_is_named_on_reading_and_on_writing(path: Path, case: s
     make, match = BROKEN[case]
     with pytest.raises(RecordingError, match=match):
         rec.write(path, make())
-    refused(plant(path, columns(make())), match)
+    refused(plant(path, make().channels), match)
 
 
 def test_a_recording_in_memory_may_not_have_other_types_or_lengths(path: Path) -> None:

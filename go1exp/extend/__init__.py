@@ -34,8 +34,8 @@ from go1exp.config.schema.registry import (
 )
 from go1exp.logs.excitations import ExcitationError, Motion
 from go1exp.logs.excitations.motion import always_on
-from go1exp.logs.importers.source import columns, joint_columns, rate, recording
-from go1exp.logs.recording import Recording, RecordingError
+from go1exp.logs.importers.source import rate, recording
+from go1exp.logs.recording import Recording, RecordingError, columns, joint_columns
 from go1exp.mdp import mirror
 from go1exp.mdp.kinematics import KinematicState
 from go1exp.mdp.measures.trace import NotMeasured, Trace

@@ -84,6 +84,16 @@ def joint_channels(quantity: str, joints: Iterable[str]) -> list[str]:
     return [joint_channel(quantity, joint) for joint in joints]
 
 
+def columns(names: Iterable[str], values: np.ndarray) -> dict[str, np.ndarray]:
+    """Split ``(T, K)`` into K named columns."""
+    return {name: np.ascontiguousarray(values[:, i]) for i, name in enumerate(names)}
+
+
+def joint_columns(quantity: str, joints: Iterable[str], values: np.ndarray) -> dict[str, np.ndarray]:
+    """Split ``(T, J)`` into the columns of one quantity."""
+    return columns(joint_channels(quantity, joints), values)
+
+
 @checked_dataclass(frozen=True, config=STRICT)
 class Meta:
     """Metadata of a recording. Wrong types, values or lengths raise pydantic's ``ValidationError``.
@@ -269,7 +279,8 @@ def _clock_problems(t: np.ndarray, rate: float) -> list[str]:
     return []
 
 
-def _stop(where: Path | str, complaints: Iterable[str]) -> None:
+def stop(where: Path | str, complaints: Iterable[str]) -> None:
+    """Raise RecordingError with all ``complaints`` about ``where``, a line each, if there are any."""
     lines = [f"{where}: {line}" for line in complaints]
     if lines:
         raise RecordingError("\n".join(lines))
@@ -296,7 +307,7 @@ def read(path: Path) -> Recording:
                 raise RecordingError(
                     f"{path}: no schema metadata {KEY.decode()!r}; not a recording of this format{IMPORT}"
                 )
-            _stop(path, _schema_problems(file))
+            stop(path, _schema_problems(file))
             table = file.read()
     except (pa.ArrowException, OSError) as error:
         why = f"not a whole Parquet file ({str(error).splitlines()[0]})"
@@ -306,11 +317,11 @@ def read(path: Path) -> Recording:
     try:
         meta = _META.validate_json(text)
     except ValidationError as error:
-        _stop(path, explain(error, "metadata", Meta.__dataclass_fields__))
+        stop(path, explain(error, "metadata", Meta.__dataclass_fields__))
         raise  # not reached: an error has lines
-    _stop(path, [f"{n}: has empty values" for n in table.column_names if table.column(n).null_count])
+    stop(path, [f"{n}: has empty values" for n in table.column_names if table.column(n).null_count])
     recording = Recording(meta, {name: np.array(table.column(name).to_numpy()) for name in table.column_names})
-    _stop(path, problems(recording))
+    stop(path, problems(recording))
     return recording
 
 
@@ -342,7 +353,7 @@ def write(path: Path, recording: Recording) -> None:
     import pyarrow.parquet as pq
 
     path = Path(path)
-    _stop(path, problems(recording))
+    stop(path, problems(recording))
     table = pa.table({name: pa.array(values) for name, values in recording.channels.items()})
     table = table.replace_schema_metadata({KEY: as_json(recording.meta)})
     path.parent.mkdir(parents=True, exist_ok=True)

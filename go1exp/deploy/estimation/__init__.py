@@ -56,11 +56,12 @@ def make_filter(config: FilterConfig) -> _kalman.Filter:
     Raises:
         EstimatorError: if the extension is missing.
     """
-    module = compiled()
-    settings = module.Settings()
-    for name in FilterConfig.__dataclass_fields__:
-        setattr(settings, name, _plain(module, name, getattr(config, name)))
-    return module.Filter(settings)
+    settings = compiled().Settings()
+    values = {name: getattr(config, name) for name in FilterConfig.__dataclass_fields__}
+    values |= {"legs": compiled_legs(config), "contact_source": SOURCES.index(config.contact_source)}
+    for name, value in values.items():
+        setattr(settings, name, value)
+    return compiled().Filter(settings)
 
 
 def compiled_legs(config: FilterConfig) -> list[_kalman.Leg]:
@@ -71,22 +72,13 @@ def compiled_legs(config: FilterConfig) -> list[_kalman.Leg]:
     Raises:
         EstimatorError: if the extension is missing.
     """
-    legs = _plain(compiled(), "legs", config.legs)
-    assert isinstance(legs, list)
-    return legs
-
-
-def _plain(module: ModuleType, name: str, value: object) -> object:
-    """Convert a setting to the type that the extension takes."""
-    if name == "legs":
-        assert isinstance(value, tuple)
-        return [
-            module.Leg.chain(leg.hip, leg.lengths)
-            if isinstance(leg, ChainLeg)
-            else module.Leg.polynomial(leg.centre, leg.scale, np.array([leg.x, leg.y, leg.z]))
-            for leg in value
-        ]
-    return SOURCES.index(str(value)) if name == "contact_source" else value
+    make = compiled().Leg
+    return [
+        make.chain(leg.hip, leg.lengths)
+        if isinstance(leg, ChainLeg)
+        else make.polynomial(leg.centre, leg.scale, np.array([leg.x, leg.y, leg.z]))
+        for leg in config.legs
+    ]
 
 
 COLUMNS = {name: getattr(readings, name.upper()) for name in ("quat", "gyro", "acc", "q", "qd", "foot_force")}

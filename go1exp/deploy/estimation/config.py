@@ -139,23 +139,17 @@ class FilterConfig:
 _CONFIG = TypeAdapter(FilterConfig)
 
 
-def go1_legs() -> tuple[ChainLeg, ChainLeg, ChainLeg, ChainLeg]:
-    """Return the legs of the Go1 in its order FR FL RR RL (dimensions: ``go1exp.robot``)."""
-    (x, y), (side, thigh, calf) = HIP_OFFSET, LINK_LENGTHS
-    signs = [(1.0 if leg[0] == "F" else -1.0, 1.0 if leg[1] == "L" else -1.0) for leg in LEGS]
-    fr, fl, rr, rl = (ChainLeg((front * x, left * y, 0.0), (left * side, thigh, calf)) for front, left in signs)
-    return fr, fl, rr, rl
-
-
 def go1(**changes: Any) -> FilterConfig:
-    """Return the settings of the Go1; keyword arguments replace some.
+    """Return the settings of the Go1, legs in its order FR FL RR RL; keyword arguments replace some.
 
     Kinematics and the position of the IMU are the vendor's; joint, gyro and attitude noise are the standard deviations
     of the paper's Table II (uniform 0.05 rad, 0.1 rad/s, 0.01 rad/s and 0.05). The rest was chosen on simulated walks,
     see ``docs/estimation.md``.
     """
+    (x, y), (side, thigh, calf) = HIP_OFFSET, LINK_LENGTHS
+    signs = [(1.0 if leg[0] == "F" else -1.0, 1.0 if leg[1] == "L" else -1.0) for leg in LEGS]
     usual: dict[str, Any] = {
-        "legs": go1_legs(),
+        "legs": tuple(ChainLeg((front * x, left * y, 0.0), (left * side, thigh, calf)) for front, left in signs),
         "imu_position": (-0.01592, -0.06659, -0.00617),
         "foot_radius": FOOT_RADIUS,
         "contact_source": "force",

@@ -67,24 +67,12 @@ class FootCalibration:
             raise CalibrationError(f"{path}: is no calibration of foot sensors: {error}") from None
 
 
-class LoadByBoth:
-    """Loads of the feet: the mean of calibrated sensors and joint torques.
+def mixed(calibration: FootCalibration, counts: np.ndarray, by_torque: np.ndarray) -> np.ndarray:
+    """Return loads (4,), N: the mean of calibrated sensors' counts (4,) and of the forces (4,), N, by torques.
 
     The torques contain the inertia of a swinging leg, the sensors an error of calibration: their errors differ in time.
     """
-
-    def __init__(self, config: FilterConfig, calibration: FootCalibration) -> None:
-        """Use the legs of ``config`` and a calibration; raise CalibrationError if the calibration has no scales."""
-        calibration.forces(np.zeros(LEGS))  # raises
-        self._legs, self._calibration = kinematics(config), calibration
-
-    def mixed(self, counts: np.ndarray, by_torque: np.ndarray) -> np.ndarray:
-        """Return loads (4,), N, from counts (4,) and the forces (4,), N, that balance the torques."""
-        return 0.5 * (self._calibration.forces(counts) + by_torque)
-
-    def loads(self, counts: np.ndarray, q: np.ndarray, torque: np.ndarray, quat: np.ndarray) -> np.ndarray:
-        """Return loads (4,), N, from counts (4,), angles (12,) rad, torques (12,) N m and the attitude w-x-y-z."""
-        return self.mixed(counts, forces_by_torque(q, torque, vertical(quat), self._legs))
+    return 0.5 * (calibration.forces(counts) + by_torque)
 
 
 def vertical(quat: np.ndarray) -> np.ndarray:

@@ -247,7 +247,6 @@ def _turned(spec: Spec, joints: Sequence[str]) -> Spec:
 
 
 def _other_histories(spec: Spec) -> Iterator[tuple[str, Spec]]:
-    """Yield contracts with the frames in another order."""
     frames = {observed.history or spec.history for observed in spec.observation}
     if max(frames) == 1:
         return

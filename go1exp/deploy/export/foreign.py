@@ -344,7 +344,6 @@ class Back(nn.Module):
     """The network's output to joint targets and to the action of this project, both in the order of ``JOINTS``."""
 
     def __init__(self, spec: Spec, config: TrainConfig) -> None:
-        """Prepare the change of order, sign, scale and offset."""
         super().__init__()
         self._inverse = [spec.names.index(name) for name in robot.JOINTS]
         sign, unit = spec.joints("joint_sign")[self._inverse], config.task.action.scale

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from go1exp.base.errors import Unusable
-from go1exp.deploy.runtime.metadata import Metadata, Port
+from go1exp.deploy.runtime.metadata import Metadata
 from go1exp.deploy.runtime.policy import OnnxPolicy
 
 MANIFEST = "manifest.json"
@@ -191,7 +191,10 @@ def load(path: str | Path) -> Bundle:
 def loads(data: bytes, source: str) -> Bundle:
     """Read a bundle from its bytes; ``source`` is its name in messages. Errors as ``load``'s."""
     members = unpack(data, MEMBERS, source)
-    metadata = _metadata(members[METADATA], source)
+    try:
+        metadata = Metadata.from_dict(_json(members[METADATA], f"{source}: {METADATA}"))
+    except ValueError as error:
+        raise BundleError(f"{source}: {METADATA}: {error}") from None
     try:
         policy = OnnxPolicy(members[POLICY], metadata.inputs, metadata.outputs)
     except ValueError as error:
@@ -246,13 +249,6 @@ def _check_action(trace: Mapping[str, np.ndarray], metadata: Metadata, source: s
         raise BundleError(f"{source}: {METADATA}: action_clip is not that of the trace")
 
 
-def _metadata(content: bytes, source: str) -> Metadata:
-    try:
-        return Metadata.from_dict(_json(content, f"{source}: {METADATA}"))
-    except ValueError as error:
-        raise BundleError(f"{source}: {METADATA}: {error}") from None
-
-
 def _json(content: bytes, where: str) -> dict[str, Any]:
     try:
         document = json.loads(content)
@@ -280,11 +276,8 @@ def _trace(content: bytes, metadata: Metadata, source: str) -> dict[str, np.ndar
             arrays = {name: np.asarray(file[name]) for name in file.files}
     except Exception as error:  # damage of a zip and of the arrays in it has many forms
         raise BundleError(f"{source}: {TRACE}: not NumPy's arrays ({error})") from None
-
-    def port_sizes(prefix: str, ports: tuple[Port, ...]) -> dict[str, int]:
-        return {f"{prefix}.{port.name}": port.size for port in ports}
-
-    sizes = {**port_sizes("input", metadata.inputs), **port_sizes("output", metadata.outputs)}
+    ports = {"input": metadata.inputs, "output": metadata.outputs}
+    sizes = {f"{kind}.{port.name}": port.size for kind, some in ports.items() for port in some}
     if arrays.keys() != {"time", *sizes}:
         odd = ", ".join(sorted(arrays.keys() ^ {"time", *sizes}))
         raise BundleError(f"{source}: {TRACE}: arrays missing or too many: {odd}")

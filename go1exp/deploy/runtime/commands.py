@@ -34,17 +34,32 @@ class CommandError(Expected):
     """A command source is not available; the message gives the reason and an alternative."""
 
 
-class Constant:
-    """A constant velocity; base of the other sources."""
+UNLIMITED = np.array([[-math.inf, math.inf]] * 3)
 
-    def __init__(self, velocity: Sequence[float]) -> None:
-        """Command the velocity (3,); raise CommandError if it is not three finite numbers."""
+
+class Constant:
+    """A constant velocity, limited to ranges; base of the other sources.
+
+    Attributes:
+        cut: number of cycles in which each axis was limited, (3,).
+    """
+
+    def __init__(self, velocity: Sequence[float], ranges: np.ndarray = UNLIMITED) -> None:
+        """Command the velocity (3,) within ``ranges`` (3, 2); raise CommandError if it is not three finite numbers."""
         self._velocity = np.array(velocity, dtype=float)
         if self._velocity.shape != (3,) or not np.isfinite(self._velocity).all():
             raise CommandError(f"command {list(velocity)}: must be three finite numbers: x m/s, y m/s, yaw rad/s")
+        self._ranges, self.cut = ranges, np.zeros(3, dtype=np.int64)
 
     def __call__(self, t: float) -> np.ndarray:
-        """Return the velocity (3,)."""
+        """Return the limited velocity (3,); NaN stays NaN, which the controller treats as a fault."""
+        command = self.wanted(t)
+        limited = np.clip(command, self._ranges[:, 0], self._ranges[:, 1])
+        self.cut += command != limited
+        return limited
+
+    def wanted(self, t: float) -> np.ndarray:
+        """Return the velocity (3,) before it is limited."""
         return self._velocity
 
     def poll(self) -> None:
@@ -57,7 +72,7 @@ class Constant:
 class Table(Constant):
     """Rows of a CSV file, each held until the next one's time; zero before the first."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, ranges: np.ndarray = UNLIMITED) -> None:
         """Read columns t, x, y, yaw (s, m/s, m/s, rad/s), with or without a line of names.
 
         Raises:
@@ -81,11 +96,11 @@ class Table(Constant):
                     raise CommandError(f"{path}:{line}: t = {rows[-1][0]:g} does not come after {rows[-2][0]:g}")
         if not rows:
             raise CommandError(f"{path}: no rows; each must be t,x,y,yaw")
-        super().__init__((0.0, 0.0, 0.0))
+        super().__init__((0.0, 0.0, 0.0), ranges)
         table = np.array(rows)
         self._times, self._rows = table[:, 0], table[:, 1:]
 
-    def __call__(self, t: float) -> np.ndarray:
+    def wanted(self, t: float) -> np.ndarray:
         """Return the latest row."""
         k = int(np.searchsorted(self._times, t + 1e-9)) - 1  # 1e-9: rounding of t must not miss a row's time
         return self._rows[k] if k >= 0 else self._velocity
@@ -94,19 +109,19 @@ class Table(Constant):
 class Sinusoid(Constant):
     """Sines of one period for all three velocities, as in the paper's velocity experiment."""
 
-    def __init__(self, amplitude: Sequence[float], period: float) -> None:
+    def __init__(self, amplitude: Sequence[float], period: float, ranges: np.ndarray = UNLIMITED) -> None:
         """Set amplitudes (3,), m/s, m/s and rad/s, and the period, s.
 
         Raises:
             CommandError: if they are not finite numbers, or the period is not positive.
         """
-        super().__init__(amplitude)
+        super().__init__(amplitude, ranges)
         if not (period > 0 and math.isfinite(period)):
             raise CommandError(f"period {period}: must be a positive number of seconds")
         self._rate = 2.0 * math.pi / period
 
-    def __call__(self, t: float) -> np.ndarray:
-        """Return the velocity (3,)."""
+    def wanted(self, t: float) -> np.ndarray:
+        """Return the velocity (3,) of the sines."""
         return self._velocity * math.sin(self._rate * t)
 
 
@@ -129,19 +144,13 @@ KEYS = "W S or up down: forward, back; A D: left, right; left right: turn; space
 class Keyboard(Constant):
     """Keys of the terminal change the velocity in steps; space makes it zero, Esc or q ends the walk."""
 
-    def __init__(
-        self,
-        stop: Stop,
-        limit: Callable[[np.ndarray], np.ndarray],
-        descriptor: int | None = None,
-        end: Stop | None = None,
-    ) -> None:
-        """Read the terminal's keys one by one; ``limit`` keeps the resulting velocity within the ranges.
+    def __init__(self, stop: Stop, ranges: np.ndarray, descriptor: int | None = None, end: Stop | None = None) -> None:
+        """Read the terminal's keys one by one; the resulting velocity is kept within the ranges.
 
         Raises:
             CommandError: if there is no terminal.
         """
-        super().__init__((0.0, 0.0, 0.0))
+        super().__init__((0.0, 0.0, 0.0), ranges)
         import termios
         import tty
 
@@ -151,7 +160,7 @@ class Keyboard(Constant):
             tty.setcbreak(self._keys)
         except (OSError, ValueError, termios.error) as error:
             raise CommandError(f"command=keyboard: standard input is no terminal ({error})") from None
-        self._stop, self._end, self._limit = stop, end or stop, limit
+        self._stop, self._end = stop, end or stop
         self._open = True
 
     def poll(self) -> None:
@@ -161,7 +170,8 @@ class Keyboard(Constant):
             if not data:
                 self._stop("end of the terminal")
                 return
-            for key in split_keys(data.decode(errors="replace")):
+            # An arrow is three characters, Esc alone is one.
+            for key in re.findall(r"\x1b[\[O].?|.", data.decode(errors="replace"), re.DOTALL):
                 self._press(key)
 
     def _press(self, key: str) -> None:
@@ -171,7 +181,7 @@ class Keyboard(Constant):
             self._velocity = np.zeros(3)
         elif key in STEPS:
             # rounded: steps of 0.1 that are added up reach zero exactly
-            self._velocity = self._limit(np.round(self._velocity + STEPS[key], 6))
+            self._velocity = np.clip(np.round(self._velocity + STEPS[key], 6), *self._ranges.T)
 
     def close(self) -> None:
         """Restore the terminal's settings."""
@@ -182,11 +192,6 @@ class Keyboard(Constant):
             termios.tcsetattr(self._keys, termios.TCSADRAIN, self._before)
 
 
-def split_keys(text: str) -> list[str]:
-    """Split the characters of a terminal into keys: an arrow is three characters, Esc alone is one."""
-    return re.findall(r"\x1b[\[O].?|.", text, re.DOTALL)
-
-
 DEAD = 0.1
 """Dead zone of a stick about its middle, as a share of its range."""
 
@@ -195,12 +200,12 @@ class Gamepad(Constant):
     """Sticks of a gamepad: left for x and y, right for yaw; any of the first two buttons stops the robot."""
 
     def __init__(self, stop: Stop, ranges: np.ndarray) -> None:
-        """Open the first gamepad; a stick at its end gives the end of the range.
+        """Open the first gamepad; a stick at its end gives the end of the range, 1 m/s or 1 rad/s where there is none.
 
         Raises:
             CommandError: if pygame is not installed, or there is no gamepad.
         """
-        super().__init__((0.0, 0.0, 0.0))
+        super().__init__((0.0, 0.0, 0.0), ranges)
         # pygame needs a video driver even for a gamepad; the robot's computer has no display.
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
@@ -214,7 +219,7 @@ class Gamepad(Constant):
             raise CommandError("command=gamepad: no gamepad is connected; or use command=keyboard")
         self._pygame = pygame
         self._pad = pygame.joystick.Joystick(0)
-        self._stop, self._ranges = stop, ranges
+        self._stop, self._ends = stop, np.where(np.isfinite(ranges), ranges, np.sign(ranges))
 
     def poll(self) -> None:
         """Read sticks and buttons."""
@@ -226,7 +231,7 @@ class Gamepad(Constant):
         last = self._pad.get_numaxes() - 1
         # Sticks count right and back as positive, commands left and forward: hence the sign.
         sticks = -np.array([self._pad.get_axis(min(axis, last)) for axis in (1, 0, 3)])
-        self._velocity = stretched(sticks, self._ranges)
+        self._velocity = stretched(sticks, self._ends)
 
     def close(self) -> None:
         """Release the gamepad."""
@@ -237,34 +242,6 @@ def stretched(sticks: np.ndarray, ranges: np.ndarray) -> np.ndarray:
     """Return the velocity (3,) for sticks (3,) from -1 to 1: 0 is zero, the ends are those of ``ranges`` (3, 2)."""
     moved = np.where(np.abs(sticks) < DEAD, 0.0, sticks)
     return np.where(moved < 0, -moved * np.minimum(ranges[:, 0], 0.0), moved * np.maximum(ranges[:, 1], 0.0))
-
-
-class Limited:
-    """A source whose commands are limited to ranges.
-
-    Attributes:
-        cut: number of cycles in which each axis was limited, (3,).
-    """
-
-    def __init__(self, source: Constant, ranges: np.ndarray) -> None:
-        """Limit the commands of ``source`` to ``ranges`` (3, 2)."""
-        self._source, self._ranges = source, ranges
-        self.cut = np.zeros(3, dtype=np.int64)
-
-    def __call__(self, t: float) -> np.ndarray:
-        """Return the limited command; NaN stays NaN, which the controller treats as a fault."""
-        command = self._source(t)
-        limited = np.clip(command, self._ranges[:, 0], self._ranges[:, 1])
-        self.cut += command != limited
-        return limited
-
-    def poll(self) -> None:
-        """Poll the source."""
-        self._source.poll()
-
-    def close(self) -> None:
-        """Close the source."""
-        self._source.close()
 
 
 def range_array(given: Mapping[str, tuple[float, float]]) -> np.ndarray:
@@ -284,7 +261,7 @@ class CommandConfig:
     period: float = 10.0
 
 
-def make(config: CommandConfig, ranges: np.ndarray, stop: Stop, end: Stop | None = None) -> Limited:
+def make(config: CommandConfig, ranges: np.ndarray, stop: Stop, end: Stop | None = None) -> Constant:
     """Return a command source, limited to ``ranges`` (3, 2).
 
     ``stop`` is called to brake at once, ``end`` (if given) for an orderly end; both with the origin of the request.
@@ -293,25 +270,20 @@ def make(config: CommandConfig, ranges: np.ndarray, stop: Stop, end: Stop | None
         CommandError: if the source is not available.
         OSError: if its file cannot be read.
     """
-    source: Constant
     if not isinstance(config.source, str):
-        source = Constant(config.source)
-    elif config.source == "sinusoid":
-        source = Sinusoid(config.amplitude, config.period)
-    elif config.source == "keyboard":
-        source = Keyboard(stop, lambda velocity: np.clip(velocity, ranges[:, 0], ranges[:, 1]), end=end)
-    elif config.source == "gamepad":
-        # A stick needs an end of the range; an axis without one gets 1 m/s or 1 rad/s.
-        finite = np.where(np.isfinite(ranges), ranges, np.sign(ranges))
-        source = Gamepad(stop, finite)
-    elif Path(config.source).suffix == ".csv":
-        source = Table(Path(config.source))
-    else:
-        raise CommandError(
-            f"command {config.source!r}: must be three numbers such as [0.5,0.0,0.0], a file.csv, "
-            "sinusoid, keyboard or gamepad"
-        )
-    return Limited(source, ranges)
+        return Constant(config.source, ranges)
+    if config.source == "sinusoid":
+        return Sinusoid(config.amplitude, config.period, ranges)
+    if config.source == "keyboard":
+        return Keyboard(stop, ranges, end=end)
+    if config.source == "gamepad":
+        return Gamepad(stop, ranges)
+    if Path(config.source).suffix == ".csv":
+        return Table(Path(config.source), ranges)
+    raise CommandError(
+        f"command {config.source!r}: must be three numbers such as [0.5,0.0,0.0], a file.csv, "
+        "sinusoid, keyboard or gamepad"
+    )
 
 
 def parsed(text: str) -> tuple[float, ...] | str:

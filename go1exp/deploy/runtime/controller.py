@@ -58,7 +58,6 @@ class Stages:
     patience: float = 5.0
 
     def __post_init__(self) -> None:
-        """Check the times."""
         times = ("stand_up", "hand_over", "lie_down", "brake")
         problems = [f"{k} = {getattr(self, k)}: must be at least 0" for k in times if not getattr(self, k) >= 0.0]
         if not self.patience > 0.0:
@@ -67,14 +66,16 @@ class Stages:
             raise ValueError("\n".join(problems))
 
 
-class Estimator(Protocol):
-    """Estimates the trunk's velocity from the robot's sensors."""
+class Estimator:
+    """Estimates the trunk's velocity from the robot's sensors. This one, of a policy without use for it, says NaN."""
 
     def update(self, state: LowState) -> np.ndarray:
         """Take a new state; return the velocity (3,), m/s, of the trunk's origin in the trunk frame, at the newest."""
+        return np.full(3, np.nan)
 
     def ahead(self, age: float) -> np.ndarray:
         """Return the velocity (3,), m/s, ``age`` s after the newest state; NaN: the age is not known."""
+        return np.full(3, np.nan)
 
 
 class Mover(Protocol):

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from go1exp.deploy.estimation import GRAVITY, FilterConfig, Status, from_json, go1, make_filter, readings, sample
-from go1exp.deploy.estimation.feet import FootCalibration, LoadByBoth
+from go1exp.deploy.estimation.feet import LEGS, FootCalibration, forces_by_torque, kinematics, mixed, vertical
+from go1exp.deploy.runtime.controller import Estimator
 from go1exp.robot.go1_fields import PERIOD
 from go1exp.robot.messages import OVERTAKEN_S, LowState
 
@@ -48,7 +49,7 @@ def settings(given: Mapping[str, Any], **changes: Any) -> FilterConfig:
     return from_json(json.dumps(dict(given)), "estimator", changes)
 
 
-class KalmanEstimator:
+class KalmanEstimator(Estimator):
     """Velocity of the trunk from every state of the robot.
 
     The filter takes states in the order of measurement. It waits for an overtaken one, ``OVERTAKEN_S`` at most.
@@ -69,9 +70,12 @@ class KalmanEstimator:
 
         Raises:
             go1exp.deploy.estimation.EstimatorError: if the compiled filter is missing.
+            go1exp.deploy.estimation.feet.CalibrationError: if the calibration has no scales.
         """
         self._filter, self._fail = make_filter(config), fail
-        self._both = None if feet is None else LoadByBoth(config, feet)
+        self._feet, self._legs = feet, kinematics(config)
+        if feet is not None:
+            feet.forces(np.zeros(LEGS))  # raises without scales
         self._velocity = np.full(3, np.nan)
         self._row: np.ndarray | None = None  # the sample of that velocity
         self._waiting: list[tuple[float, int, LowState, np.ndarray]] = []  # a heap of what waits: clock, count, sample
@@ -130,8 +134,9 @@ class KalmanEstimator:
 
     def _sample(self, state: LowState, clock: float) -> np.ndarray:
         forces = state.foot_force
-        if self._both is not None:
-            forces = self._both.loads(forces, state.joint_pos, state.joint_torque, state.imu_quat)
+        if self._feet is not None:
+            by_torque = forces_by_torque(state.joint_pos, state.joint_torque, vertical(state.imu_quat), self._legs)
+            forces = mixed(self._feet, forces, by_torque)
         return sample(
             clock,
             state.imu_quat,
@@ -179,15 +184,3 @@ def acceleration(row: np.ndarray, velocity: np.ndarray) -> np.ndarray:
             fz - GRAVITY * (1.0 - 2.0 * (x * x + y * y)) - (a * v - b * u),
         )
     )
-
-
-class NoEstimator:
-    """Estimator of a policy that does not use the velocity."""
-
-    def update(self, state: LowState) -> np.ndarray:
-        """Return NaN."""
-        return np.full(3, np.nan)
-
-    def ahead(self, age: float) -> np.ndarray:
-        """Return NaN."""
-        return np.full(3, np.nan)

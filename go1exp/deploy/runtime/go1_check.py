@@ -95,21 +95,16 @@ class Observed:
         return delays([arrived for _, arrived in self.ticks], clock)
 
 
-def listen(
-    link: Go1Link,
-    seconds: float,
-    now: Callable[[], float] = time.perf_counter,
-    sleep: Callable[[float], None] = time.sleep,
-) -> Observed:
+def listen(link: Go1Link, seconds: float) -> Observed:
     """Receive states for ``seconds`` s; no torque is commanded."""
-    observed, begin = Observed(), now()
-    while now() - begin < seconds:
+    observed, begin = Observed(), time.perf_counter()
+    while time.perf_counter() - begin < seconds:
         states = link.receive()
         if states:
             observed.states.extend(states)
             observed.ticks.append((link.tick or 0, states[-1].t))
-        sleep(PERIOD)
-    observed.seconds = now() - begin
+        time.sleep(PERIOD)
+    observed.seconds = time.perf_counter() - begin
     observed.health = link.health
     return observed
 

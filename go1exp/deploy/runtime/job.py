@@ -21,7 +21,7 @@ from go1exp.deploy.runtime.bundle import Bundle
 from go1exp.deploy.runtime.commands import KEYS, make, range_array
 from go1exp.deploy.runtime.controller import Mover
 from go1exp.deploy.runtime.estimate import settings as estimator_settings
-from go1exp.deploy.runtime.go1_check import Findings, calibrate, check
+from go1exp.deploy.runtime.go1_check import calibrate, check
 from go1exp.deploy.runtime.go1_wire import gains_on_wire
 from go1exp.deploy.runtime.launch import RefusedError, RobotError, SimulatedRobot
 from go1exp.deploy.runtime.log import About
@@ -84,7 +84,13 @@ def _connected(job: Job, bundle: Bundle, say: Say) -> Iterator[tuple[Go1Link, Si
         if job.robot == "go1":
             say(NOTICE)
             link = stack.enter_context(closing(Go1Link(*parsed_address(job.address))))
-            link.tick_s = _checked(link, bundle, say).tick_s
+            about = bundle.metadata
+            limits = about.joints, np.array(about.joint_limits), estimator_settings(about.estimator)
+            findings = check(link, *limits, say)
+            if findings.problems:
+                why = "; ".join(findings.problems)
+                raise RobotError(f"the robot does not pass its check, so no walk begins: {why}")
+            link.tick_s = findings.tick_s
             yield link, None
         elif job.robot == "sim":
             say("starting the simulated robot")
@@ -96,15 +102,6 @@ def _connected(job: Job, bundle: Bundle, say: Say) -> Iterator[tuple[Go1Link, Si
                     f"robot={job.robot}: must be sim, go1, or the port where a simulated robot listens", status=REFUSED
                 )
             yield stack.enter_context(closing(Go1Link(HOST, int(job.robot), SIMULATED_TICK_S))), None
-
-
-def _checked(link: Go1Link, bundle: Bundle, say: Say) -> Findings:
-    """Return the findings about a robot that passes its check; raise RobotError if it does not."""
-    about = bundle.metadata
-    findings = check(link, about.joints, np.array(about.joint_limits), estimator_settings(about.estimator), say)
-    if findings.problems:
-        raise RobotError("the robot does not pass its check, so no walk begins: " + "; ".join(findings.problems))
-    return findings
 
 
 def run_check(joints: Sequence[str], stops: np.ndarray, feet: Path, address: str | None, say: Say) -> int:
@@ -179,12 +176,7 @@ def run_job(job: Job, say: Say) -> int:
 
 
 def _prepare(job: Job, bundle: Bundle, feet: FootCalibration | None, say: Say) -> None:
-    """Refuse what cannot walk before anything is started, and report the choices that were made.
-
-    Raises:
-        go1exp.base.errors.Expected: if the bundle is unfit, or its commands are not available.
-        OSError: if a file cannot be read, or the folder of the logs not written.
-    """
+    """Refuse what cannot walk before anything is started, and report the choices that were made."""
     about, plan = bundle.metadata, job.plan
     refuse_unfit(bundle)
     if about.kp is None or about.kd is None:
@@ -228,12 +220,7 @@ BY_BOTH = "foot contact: from joint torques and the foot sensors, calibrated by 
 
 
 def _calibration(job: Job) -> FootCalibration | None:
-    """Return the calibration of the foot sensors, if there is one.
-
-    Raises:
-        RefusedError: if the sensors need none.
-        go1exp.deploy.estimation.feet.CalibrationError: if the file is invalid, or has no scales yet.
-    """
+    """Return the calibration of the foot sensors, if there is one; refuse one that is invalid, or is not needed."""
     if job.feet is None:
         return None
     if not job.counting:
@@ -245,7 +232,6 @@ def _calibration(job: Job) -> FootCalibration | None:
 
 
 def _about(job: Job, bundle: Bundle) -> About:
-    """Return the origin of a walk's log."""
     about = bundle.metadata
     gains = gains_on_wire(*(job.gains or (np.array(about.kp), np.array(about.kd))))
     return About(

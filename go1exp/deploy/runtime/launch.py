@@ -34,7 +34,6 @@ class RefusedError(RobotError):
     """
 
     def __init__(self, problems: list[str]) -> None:
-        """Set the problems."""
         super().__init__("; ".join(problems), status=REFUSED)
         self.problems = problems
 
@@ -140,5 +139,4 @@ class SimulatedRobot(contextlib.AbstractContextManager["SimulatedRobot"]):
         self._folder.cleanup()
 
     def __exit__(self, *error: object) -> None:
-        """Close."""
         self.close()

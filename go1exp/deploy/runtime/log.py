@@ -70,11 +70,7 @@ class Ring:
 
     def part(self, name: str) -> np.ndarray:
         """Return a part of all rows that are kept, (T, width), or (T,) if its width is 1."""
-        return self.part_of(self.rows(), name)
-
-    def part_of(self, rows: np.ndarray, name: str) -> np.ndarray:
-        """Return a part of ``rows`` (T, ...), as ``part`` does of those that are kept."""
-        values = rows[:, self.columns[name]]
+        values = self.rows()[:, self.columns[name]]
         return values[:, 0] if values.shape[1] == 1 else values
 
 
@@ -185,22 +181,22 @@ class Log:
 
     def _channels(self, about: About, kept: np.ndarray, targets: np.ndarray) -> dict[str, np.ndarray]:
         """Return what was measured in the states ``kept`` (S,) bool, by column, each (T,), with targets (T, J)."""
-        from go1exp.logs.recording import FOOT_FORCE, VECTORS, joint_channels
+        from go1exp.logs.recording import FOOT_FORCE, VECTORS, columns, joint_columns
 
         joints = about.metadata.joints
         channels: dict[str, np.ndarray] = {}
         for name in ("q", "qd", "tau_est"):
-            channels |= dict(zip(joint_channels(name, joints), self.measured(name)[kept].T, strict=True))
-        channels |= dict(zip(joint_channels("q_target", joints), targets.T, strict=True))
+            channels |= joint_columns(name, joints, self.measured(name)[kept])
+        channels |= joint_columns("q_target", joints, targets)
         quat = self.measured("imu_quat")[kept]
         length = np.linalg.norm(quat, axis=1, keepdims=True)
         quat = quat / np.where(length > 0.5, length, np.nan)  # an IMU that has not started has no attitude
         vectors = {"imu_quat": quat} | {name: self.measured(name)[kept] for name in ("imu_gyro", "imu_acc")}
         for name, values in vectors.items():
-            channels |= dict(zip(VECTORS[name], values.T, strict=True))
+            channels |= columns(VECTORS[name], values)
         if about.newton:
-            feet = self.measured("foot_force")[kept]
-            channels |= {FOOT_FORCE + leg: feet[:, k] for k, leg in enumerate(about.metadata.legs)}
+            legs = (FOOT_FORCE + leg for leg in about.metadata.legs)
+            channels |= columns(legs, self.measured("foot_force")[kept])
         return channels
 
     def measured(self, name: str) -> np.ndarray:
@@ -208,11 +204,10 @@ class Log:
 
         An overtaken state counts as having arrived with the first of those that overtook it.
         """
-        rows = self.states.rows()
-        clock = self.states.part_of(rows, "clock")
+        clock, part = self.states.part("clock"), self.states.part(name)
         if np.isnan(clock).any() or (np.diff(clock) >= 0.0).all():
-            return self.states.part_of(rows, name)
-        part = self.states.part_of(rows, name)[np.argsort(clock, kind="stable")]
+            return part
+        part = part[np.argsort(clock, kind="stable")]
         return np.minimum.accumulate(part[::-1])[::-1] if name == "t" else part
 
     def _reported(self, about: About, applied: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
@@ -244,7 +239,6 @@ UNKNOWN_DELAY = (
 
 
 def _meta(about: About, channels: Mapping[str, np.ndarray], notes: str) -> Meta:
-    """Return the description of a recording with these channels."""
     from go1exp.logs.recording import VECTORS, Meta
 
     return Meta(

@@ -12,22 +12,11 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 KEPT = 200_000
 """Newest cycles that are kept for the percentiles: 500 s at 400 Hz."""
-
-
-class Clock(Protocol):
-    """A clock."""
-
-    def now(self) -> float:
-        """Return the time, s; it never decreases."""
-
-    def sleep_until(self, when: float) -> None:
-        """Return at ``when`` or a little later; at once if that has passed."""
 
 
 BETWEEN_S = 0.002
@@ -60,11 +49,11 @@ class MonotonicClock:
         self._spin, self._meanwhile, self._between, self._prepare = spin, meanwhile, between, prepare
 
     def now(self) -> float:
-        """Return the time, s."""
+        """Return the time, s; it never decreases."""
         return time.perf_counter()
 
     def sleep_until(self, when: float) -> None:
-        """Sleep, then poll the clock for the last ``spin`` s."""
+        """Return at ``when`` or a little later; at once if that has passed."""
         wake = when - self._spin
         while self._between is not None and wake - time.perf_counter() > BETWEEN_S:
             time.sleep(BETWEEN_S)
@@ -114,7 +103,6 @@ class Timing:
         return self.missed / max(self.cycles + self.left_out, 1)
 
     def __str__(self) -> str:
-        """Return a line for the terminal and the log."""
         period = f"period p50 {1e3 * self.period_p50:.3f}, p99 {1e3 * self.period_p99:.3f}, "
         period += f"worst {1e3 * self.period_worst:.3f} ms"
         work = (
@@ -124,10 +112,9 @@ class Timing:
 
 
 class Deadlines:
-    """Counts cycles and deadlines of a loop; allocates memory only when it is built."""
+    """Counts cycles of ``period`` s and deadlines of a loop; allocates memory only when it is built."""
 
     def __init__(self, period: float, kept: int = KEPT) -> None:
-        """Start counting cycles of ``period`` s."""
         self._period = period
         self._periods, self._work = np.zeros(kept), np.zeros(kept)
         self.cycles = self.missed = self.left_out = 0
@@ -180,7 +167,7 @@ def run(
     work: Callable[[float], bool],
     rate: float,
     seconds: float | None = None,
-    clock: Clock | None = None,
+    clock: MonotonicClock | None = None,
     on_report: Callable[[Timing], None] | None = None,
     report_every: float = 1.0,
 ) -> Timing:
@@ -193,7 +180,7 @@ def run(
         work: one cycle; gets the clock's time at its start, s.
         rate: cycles per second.
         seconds: duration, s; None: until ``work`` returns False.
-        clock: the system's monotonic one if None.
+        clock: one without spin if None.
         on_report: called with the timing every ``report_every`` s, after the work of a cycle.
         report_every: s.
     """

@@ -48,7 +48,8 @@ class OnnxPolicy:
         try:
             self._session = ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # of classes that onnxruntime does not export
-            raise ValueError(f"not a graph that onnxruntime {ort.__version__} runs ({_first_line(error)})") from None
+            reason = str(error).strip().partition("\n")[0]
+            raise ValueError(f"not a graph that onnxruntime {ort.__version__} runs ({reason})") from None
         self.inputs, self.outputs = tuple(inputs), tuple(outputs)
         _compare("input", self._session.get_inputs(), self.inputs)
         _compare("output", self._session.get_outputs(), self.outputs)
@@ -95,10 +96,6 @@ def _compare(what: str, nodes: Sequence[NodeArg], wanted: Sequence[Port]) -> Non
             raise ValueError(
                 f"{what} {node.name}: {node.type} of shape {node.shape}; must be float (rows, {port.size})"
             )
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().split("\n")[0]
 
 
 A = TypeVar("A", bound=Any)  # an array of NumPy or torch

@@ -61,7 +61,6 @@ class Fault:
     message: str
 
     def __str__(self) -> str:
-        """Return a line for the log."""
         return f"{self.name} at {self.t:.3f} s: {self.message}"
 
 

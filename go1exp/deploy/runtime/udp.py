@@ -95,6 +95,7 @@ class Go1Link:
 
     Attributes:
         traffic: counts of its datagrams.
+        tick: of the newest state; None before the first.
         tick_s: unit of the robot's tick, s; NaN if unknown: then states have no clock and lost ones are not counted.
         sent_at: time at which the last command was sent, s; NaN before.
         newest: packet of the last accepted state; empty before the first.
@@ -111,16 +112,11 @@ class Go1Link:
             self._socket.close()
             raise
         self.traffic, self.tick_s, self.newest = Traffic(), tick_s, b""
-        self._last: int | None = None
+        self.tick: int | None = None
         self._first = 0
         self._ticks: deque[int] = deque(maxlen=REMEMBERED)
         self._clock, self._packet = math.nan, go1_wire.IDLE
         self._last_sent, self.sent_at = -math.inf, math.nan
-
-    @property
-    def tick(self) -> int | None:
-        """Tick of the newest state; None before the first."""
-        return self._last
 
     @property
     def health(self) -> go1_wire.Health | None:
@@ -130,7 +126,7 @@ class Go1Link:
     def receive(self) -> Sequence[LowState]:
         """Return the states that have arrived since the last call, in the order of arrival, without waiting."""
         states = [state for datagram in self._datagrams() if (state := self._accepted(*datagram)) is not None]
-        if self._last is None or self._packet is go1_wire.IDLE:
+        if self.tick is None or self._packet is go1_wire.IDLE:
             self.repeat()
         return states
 
@@ -154,7 +150,7 @@ class Go1Link:
             self.traffic.refused_because[wrong.value] = self.traffic.refused_because.get(wrong.value, 0) + 1
             return None
         tick = go1_wire.tick_of(data)
-        ahead = None if self._last is None else go1_wire.newer(tick, self._last)
+        ahead = None if self.tick is None else go1_wire.newer(tick, self.tick)
         if ahead is not None and ahead <= 0:
             return self._overtaken(data, ancillary, tick, ahead)
         if ahead is None:
@@ -166,7 +162,7 @@ class Go1Link:
             self._clock += ahead * self.tick_s
             self.traffic.lost += max(round(ahead * self.tick_s / PERIOD) - 1, 0)
         self.traffic.received += 1
-        self._last, self.newest = tick, data
+        self.tick, self.newest = tick, data
         self._ticks.append(tick)
         return go1_wire.unpack_state(data, arrival(ancillary), self._clock)
 
@@ -258,7 +254,6 @@ class PacketDelay:
     """Delays of packets relative to the fastest of the last ``WINDOW_S``."""
 
     def __init__(self) -> None:
-        """Start without any packet."""
         # Arrival and offset. Offsets increase, so that the first is the least.
         self._least: deque[tuple[float, float]] = deque()
 

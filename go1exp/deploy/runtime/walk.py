@@ -17,9 +17,9 @@ from go1exp.base import signals
 from go1exp.base.errors import FAULTS, FIRST_FAULT, UNKNOWN_FAULT
 from go1exp.deploy.estimation.feet import FootCalibration
 from go1exp.deploy.runtime.bundle import Bundle
-from go1exp.deploy.runtime.commands import CommandConfig, Limited, make, range_array
+from go1exp.deploy.runtime.commands import CommandConfig, Constant, make, range_array
 from go1exp.deploy.runtime.controller import STAND_PATIENCE, Controller, Cycle, Estimator, Mover, Stages
-from go1exp.deploy.runtime.estimate import BOTH, TORQUE, KalmanEstimator, NoEstimator, settings
+from go1exp.deploy.runtime.estimate import BOTH, TORQUE, KalmanEstimator, settings
 from go1exp.deploy.runtime.log import Log
 from go1exp.deploy.runtime.loop import MonotonicClock, Timing, run
 from go1exp.deploy.runtime.safety import Fault, Safety, SafetyConfig
@@ -73,7 +73,7 @@ class Outcome:
     timing: Timing
     log: Log
     safety: Safety
-    commands: Limited
+    commands: Constant
     estimator: dict[str, int]
     memory_mb: float | None
     requested_by: str = ""
@@ -120,7 +120,7 @@ def walk(
     with contextlib.closing(make(plan.command, ranges, safety.stop, stop_requests.append)) as commands:
         walk = _Walk(bundle, link, plan, safety, estimator, commands, stop_requests, mover, gains)
         with _stopping(safety):
-            clock = MonotonicClock(plan.spin, walk.rehearse, link.repeat, walk.prepare)
+            clock = MonotonicClock(plan.spin, walk.rehearse, link.repeat, walk.controller.prepare)
             timing = run(walk.cycle, walk.rate, None, clock, lambda timing: on_second(walk.status(timing)))
         return walk.outcome(timing)
 
@@ -130,7 +130,7 @@ def _estimator(
 ) -> Estimator:
     """Return the estimator of a bundle's policy; none if the policy has no use for it, unless ``needed``."""
     if not needed and all(port.name != "base_lin_vel_b" for port in bundle.policy.inputs):
-        return NoEstimator()
+        return Estimator()
     changes: dict[str, str | float] = {}
     if contact == "torque":
         changes = TORQUE if feet is None else BOTH
@@ -139,8 +139,6 @@ def _estimator(
 
 
 class _Walk:
-    """A walk in progress: its cycle, and its end."""
-
     def __init__(
         self,
         bundle: Bundle,
@@ -148,7 +146,7 @@ class _Walk:
         plan: Plan,
         safety: Safety,
         estimator: Estimator,
-        commands: Limited,
+        commands: Constant,
         stop_requests: list[str],
         mover: Mover | None,
         gains: tuple[np.ndarray, np.ndarray] | None,
@@ -163,7 +161,7 @@ class _Walk:
             room = min(room, plan.seconds + stages + 1.0)
         self._log = Log(self.rate, room)
         self._walked, self._ended_by, self._velocity = 0.0, "", np.zeros(3)
-        self._controller = Controller(
+        self.controller = Controller(
             *(bundle, link, commands, estimator, safety),
             rate=self.rate,
             stages=plan,
@@ -184,7 +182,7 @@ class _Walk:
             self._end_when_time_is_up(now)
         self._follow_stop_requests(now)
         try:
-            return self._controller.cycle(now)
+            return self.controller.cycle(now)
         except Exception as error:  # of the link or the log: a cycle raises nothing else
             self._safety.fail("runtime", f"{type(error).__name__}: {error}", now)
             with contextlib.suppress(Exception):
@@ -192,8 +190,8 @@ class _Walk:
             return False
 
     def _end_when_time_is_up(self, now: float) -> None:
-        self._walked = max(self._walked, self._controller.walked(now))
-        if self._plan.seconds is None or self._controller.phase != "walking":
+        self._walked = max(self._walked, self.controller.walked(now))
+        if self._plan.seconds is None or self.controller.phase != "walking":
             return
         if self._walked > self._plan.seconds - 0.5 / self.rate:  # the next cycle would be the first one too many
             self._end_in_order(TIME, now)
@@ -201,7 +199,7 @@ class _Walk:
     def _follow_stop_requests(self, now: float) -> None:
         """End the walk in order at the first request; brake at a second one, or where there is nothing to end."""
         for who in self._stop_requests:
-            if self._ended_by or not self._plan.lie_down or self._controller.phase == "waiting":
+            if self._ended_by or not self._plan.lie_down or self.controller.phase == "waiting":
                 self._safety.stop(who)
             else:
                 self._end_in_order(who, now)
@@ -209,28 +207,24 @@ class _Walk:
 
     def _end_in_order(self, who: str, now: float) -> None:
         self._ended_by = who
-        self._controller.finish(now)
+        self.controller.finish(now)
 
     def rehearse(self) -> None:
         """Make a cycle that sends nothing, so that the next one is quick."""
         with contextlib.suppress(Exception):  # the cycle itself finds the error
-            self._controller.rehearse()
-
-    def prepare(self) -> None:
-        """Process the states that have arrived already."""
-        self._controller.prepare()
+            self.controller.rehearse()
 
     def status(self, timing: Timing) -> str:
         """Return a line on phase, timing and estimated velocity."""
         x, y, z = self._velocity
         speed = "" if np.isnan(self._velocity).any() else f"; estimate {x:+.2f} {y:+.2f} {z:+.2f} m/s"
-        return f"{self._controller.phase}: {timing}{speed}"
+        return f"{self.controller.phase}: {timing}{speed}"
 
     def outcome(self, timing: Timing) -> Outcome:
         """Return the result of the walk."""
         estimator = self._estimator
         refused = dict(getattr(estimator, "refused", {}), RESTARTED=getattr(estimator, "restarts", 0))
-        fault = None if self._controller.finished else self._safety.fault
+        fault = None if self.controller.finished else self._safety.fault
         parts = timing, self._log, self._safety, self._commands, refused, _resident()
         return Outcome(fault, self._walked, *parts, self._ended_by.removeprefix(TIME))
 

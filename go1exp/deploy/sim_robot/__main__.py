@@ -66,14 +66,6 @@ def sim_config(given: dict[str, Any]) -> SimConfig:
         raise ConfigError(explain(error, "sim", SimConfig.__dataclass_fields__)) from None
 
 
-def _line(descriptor: int) -> bytes:
-    """Read a line byte by byte: a buffered reader could take more than the line, which ``select`` would not see."""
-    text = b""
-    while not text.endswith(b"\n") and (part := os.read(descriptor, 1)):
-        text += part
-    return text
-
-
 def _say(what: str, **content: object) -> None:
     sys.stdout.write(json.dumps({"what": what, **content}) + "\n")
     sys.stdout.flush()
@@ -85,7 +77,9 @@ def main() -> int:
     ended: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, frame: ended.append(number))
     torch.set_num_threads(1)
-    given = json.loads(_line(sys.stdin.fileno()))
+    # Unbuffered: a buffered reader could take more than the line, which ``select`` would not see.
+    with open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as unbuffered:
+        given = json.loads(unbuffered.readline())
     try:
         config = sim_config(given.get("sim", {}))
         task = bundle_task(given["bundle"], given.get("robot", {}))
@@ -101,7 +95,7 @@ def main() -> int:
 
     server.serve(going)
     if given.get("truth"):
-        rows, applied = server.truth.rows(), server.applied.rows()
+        rows, applied = np.array(server.truth), np.array(server.applied)
         np.savez(given["truth"], rows=rows, columns=np.array(["clock", *TRUTH]), applied=applied)
     _say("ended", **asdict(server.counts))
     server.close()

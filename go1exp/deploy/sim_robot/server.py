@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from go1exp.deploy.runtime import go1_wire
-from go1exp.deploy.runtime.loop import MonotonicClock, Timing, run
+from go1exp.deploy.runtime.loop import Timing, run
 from go1exp.deploy.runtime.safety import DEFAULT_KD
 from go1exp.deploy.runtime.udp import HOST, arrival, enable_timestamps, listening
 from go1exp.deploy.sim_robot import SimConfig
 from go1exp.deploy.sim_robot.machine import TICK, Robot
-from go1exp.robot.go1_fields import COMMAND_SIZE, JOINTS, LEGS
+from go1exp.robot.go1_fields import COMMAND_SIZE, LEGS
 from go1exp.robot.messages import LowCmd, LowState
 
 TICK_MS = 2
@@ -76,23 +76,6 @@ class Network:
         return arrived
 
 
-class Newest:
-    """The newest rows of numbers by the robot's clock."""
-
-    def __init__(self, width: int, kept: float) -> None:
-        """Keep the rows of ``width`` numbers of the last ``kept`` s."""
-        self._width = width
-        self._rows: deque[np.ndarray] = deque(maxlen=math.ceil(kept / TICK) + 1)
-
-    def add(self, clock: float, values: np.ndarray) -> None:
-        """Keep a row."""
-        self._rows.append(np.array([clock, *values]))
-
-    def rows(self) -> np.ndarray:
-        """Return what is kept: clock, and the values, (T, 1 + width)."""
-        return np.array(self._rows).reshape(-1, 1 + self._width)
-
-
 ZERO, SCALE = (100.0, 130.0), (0.5, 1.5)
 """Ranges from which ``sim.feet=raw`` draws zeros (counts; 114 to 125 on one robot) and scales (chosen)."""
 
@@ -133,7 +116,6 @@ class Packets:
     """
 
     def __init__(self, config: SimConfig) -> None:
-        """Draw the zeros and scales of the foot sensors."""
         self.feet, self.health = FootSensors(config), go1_wire.Health()
         self._last_velocity: np.ndarray | None = None
 
@@ -200,8 +182,9 @@ class Server:
         address: where it listens.
         counts: of packets.
         peer: address of the client; None before the first packet.
-        truth: the newest of the trunk's true motion.
-        applied: the newest applied commands: whether one applied, its targets, rad, and gains (``Robot.applied``).
+        truth: newest rows of the trunk's true motion: the robot's clock, s, and ``TRUTH``.
+        applied: newest rows of applied commands: clock, s, and whether one applied, its targets, rad, and gains
+            (``Robot.applied``).
         packets: packs states and unpacks commands.
         on_heard: called for each packet of ``peer`` with its time of arrival, s on ``time.perf_counter``'s clock.
         on_tick: called after each tick.
@@ -225,7 +208,8 @@ class Server:
         self.address: tuple[str, int] = self._socket.getsockname()
         self.peer: tuple[str, int] | None = None
         self._heard = -math.inf
-        self.counts, self.truth, self.applied = Counts(), Newest(len(TRUTH), kept), Newest(3 + JOINTS, kept)
+        self.counts = Counts()
+        self.truth, self.applied = (deque[np.ndarray](maxlen=math.ceil(kept / TICK) + 1) for _ in range(2))
 
     @property
     def port(self) -> int:
@@ -234,7 +218,6 @@ class Server:
 
     def serve(self, going: Callable[[], bool], seconds: float | None = None) -> Timing:
         """Run in real time while ``going``; return the timing."""
-        clock = MonotonicClock()
         begin, calls = math.inf, 0
 
         def work(now: float) -> bool:
@@ -252,7 +235,7 @@ class Server:
             calls += 1
             return calls % ASK_EVERY != 0 or going()
 
-        timing = run(work, 1.0 / TICK, seconds, clock)
+        timing = run(work, 1.0 / TICK, seconds)
         self.counts.timing = asdict(timing)
         return timing
 
@@ -265,8 +248,8 @@ class Server:
         # The newest command acts in this tick; the state that is sent is of its beginning.
         robot.step()
         state, true = robot.sense()
-        self.truth.add(now, true)
-        self.applied.add(now, robot.applied())
+        self.truth.append(np.array([now, *true]))
+        self.applied.append(np.array([now, *robot.applied()]))
         data = self.packets.written(state, round(now / TICK))
         if self.peer is not None:
             self._downlink.put(now, data)

@@ -56,16 +56,11 @@ def audit(recording: Recording) -> AuditReport:
     return replace(report, impossible=left_out)
 
 
-@dataclass(frozen=True)
-class _Measured:
-    """What the checks measured of each channel, by its name: share of repeats, noise floor, delay."""
-
-    repeats: dict[str, float]
-    floors: dict[str, float]
-    delays: dict[str, Delay]
+Measured = tuple[dict[str, float], dict[str, float], dict[str, Delay]]
+"""What the checks measured of each channel, by its name: share of repeats, noise floor, delay."""
 
 
-def _run_checks(log: Log) -> tuple[list[Finding], _Measured]:
+def _run_checks(log: Log) -> tuple[list[Finding], Measured]:
     """Run every check; findings come in the order in which the report prints those of equal verdict."""
     stale_findings, repeats = single.stale(log)
     noise_findings, floors = single.noise(log, repeats)
@@ -87,27 +82,18 @@ def _run_checks(log: Log) -> tuple[list[Finding], _Measured]:
         *commands.order_and_sign(log),
         *delay_findings,
     ]
-    return findings, _Measured(repeats, floors, delays)
+    return findings, (repeats, floors, delays)
 
 
-def _channel_table(log: Log, findings: list[Finding], measured: _Measured) -> tuple[Channel, ...]:
+def _channel_table(log: Log, findings: list[Finding], measured: Measured) -> tuple[Channel, ...]:
+    repeats, floors, delays = measured
     table = []
     for name, values in log.recording.channels.items():
-        delay = measured.delays.get(name)
-        table.append(
-            Channel(
-                name,
-                worst(f.verdict for f in findings if f.channel in (name, log.quantity.get(name))),
-                log.unit(name),
-                float(values.min()),
-                float(values.max()),
-                log.steps.get(name),
-                measured.floors.get(name),
-                measured.repeats.get(name),
-                None if delay is None else delay.time * 1e3,
-                None if delay is None else delay.error * 1e3,
-            )
-        )
+        verdict = worst(f.verdict for f in findings if f.channel in (name, log.quantity.get(name)))
+        numbers = float(values.min()), float(values.max()), log.steps.get(name), floors.get(name), repeats.get(name)
+        delay = delays.get(name)
+        after = (None, None) if delay is None else (delay.time * 1e3, delay.error * 1e3)
+        table.append(Channel(name, verdict, log.unit(name), *numbers, *after))
     return tuple(table)
 
 
@@ -162,7 +148,6 @@ class CommandDelay:
         return f"{1e3 * self.time:.1f} ± {1e3 * self.error:.1f} ms"
 
     def __str__(self) -> str:
-        """Return it with the recording, in words."""
         return f"{self.measured} ({self.episode})"
 
     def differs_from(self, other: CommandDelay) -> bool:
@@ -229,7 +214,6 @@ class _Clock:
     since_1970: bool
 
     def __str__(self) -> str:
-        """Return it in words."""
         steps = f"steps vary by {self.jitter:.1%}" if self.jitter else "counted steps"
         return f"{self.rate_hz:.4g} Hz, {steps}" + (", seconds since 1970" if self.since_1970 else "")
 

@@ -33,9 +33,8 @@ def quantum(values: np.ndarray) -> float:
     gaps = np.diff(distinct)
     largest = float(np.abs(distinct[[0, -1]]).max())
     gaps = np.sort(gaps[gaps > 1e-9 * largest])
-    if len(gaps) < (
-        2 if len(values) > 20 * len(distinct) else 10
-    ):  # few distinct values that occur often are quantised too
+    least = 2 if len(values) > 20 * len(distinct) else 10  # few distinct values that occur often are quantised too
+    if len(gaps) < least:
         return 0.0
     gaps = gaps[:: -(-len(gaps) // MOST_GAPS)]
     guesses = {float(gaps[int(share * len(gaps))]) / m for share in (0, 0.02, 0.1, 0.5) for m in range(1, 7)}

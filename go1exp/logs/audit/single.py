@@ -170,9 +170,8 @@ def dead(log: Log) -> Iterator[Finding]:
         # A constant channel is bad only if something shows that the measured quantity must have changed.
         if quantity in ("qd", "tau_est"):
             joint = name.removeprefix(f"{quantity}_")
-            verdict, why = (
-                ("bad", "while the joint moves") if moved.get(joint, False) else ("ok", "and the joint rests")
-            )
+            live = moved.get(joint, False)
+            verdict, why = ("bad", "while the joint moves") if live else ("ok", "and the joint rests")
         elif quantity == "q":
             target = log.recording.channels.get(name.replace("q_", "q_target_", 1))
             if target is None:
@@ -243,11 +242,8 @@ def saturation(log: Log) -> Iterator[Finding]:
             limit = _torque_limit(log, name.removeprefix("tau_est_"))
             if limit is None or all(abs(abs(v) / limit - 1) < 0.02 for v in levels):
                 verdict = "ok"
-                message += (
-                    ": the actuator's limit"
-                    if limit
-                    else ": perhaps the actuator's limit, which the file does not give"
-                )
+                known = ": the actuator's limit"
+                message += known if limit else ": perhaps the actuator's limit, which the file does not give"
             else:
                 message += f", but the limit is {limit:.4g} N m"
         yield finding("saturation", name, verdict, share, "", message)

@@ -42,9 +42,8 @@ def squat(
     duration = check(t, centre, limits)
     shares = np.linspace(0, depth, 201)
     bent = np.stack([_lowered(centre, limits, share) for share in shares])
-    angles = (
-        centre + (bent - bent[0] + np.pi) % (2 * np.pi) - np.pi
-    )  # as a change from bent[0], so that share 0 is exactly the stance
+    # as a change from bent[0], so that share 0 is exactly the stance
+    angles = centre + (bent - bent[0] + np.pi) % (2 * np.pi) - np.pi
     inside = np.all((angles >= limits[:, 0] - 1e-9) & (angles <= limits[:, 1] + 1e-9), axis=1)
     deepest = depth if inside.all() else shares[np.argmin(inside) - 1]
     times, levels = [0.0], [0.0]

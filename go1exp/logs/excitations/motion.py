@@ -64,11 +64,6 @@ def check(t: np.ndarray, centre: np.ndarray, limits: np.ndarray, fastest_hz: flo
     return float(t[-1] - t[0])
 
 
-def spread(values: tuple[float, ...], num_joints: int) -> np.ndarray:
-    """Repeat ``values`` over the joints: ``(J,)``."""
-    return np.resize(np.asarray(values, dtype=float), num_joints)
-
-
 def room(
     amplitude: tuple[float, ...] | np.ndarray, centre: np.ndarray, limits: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from go1exp.config.schema.registry import Annotated, Field, Fraction, NonNegative, Positive, PositiveRange, excitation
-from go1exp.logs.excitations.motion import Motion, PerKind, always_on, check, ease, spread, swing
+from go1exp.logs.excitations.motion import Motion, PerKind, always_on, check, ease, swing
 
 Lines = Annotated[int, Field(ge=1, le=64)]
 """Number of sines in a sum."""
@@ -56,7 +56,7 @@ def chirp(
     wave = [
         signal.chirp(time, f, duration, g, "logarithmic", phi) for f, g, phi in zip(first, last, phase, strict=True)
     ]
-    fastest = 2 * np.pi * first * (last / first) ** (time[:, None] / duration) * spread(amplitude, joints)
+    fastest = 2 * np.pi * first * (last / first) ** (time[:, None] / duration) * np.resize(amplitude, joints)
     wave_in_reach = np.stack(wave, axis=1) / np.hypot(1, fastest / speed)
     return always_on(swing(t, wave_in_reach, amplitude, centre, limits, fade), "suspended")
 
@@ -152,7 +152,7 @@ def slow_ramps(
     """
     duration = check(t, centre, limits)
     target = np.empty((len(t), len(centre)))
-    amplitudes = spread(amplitude, len(centre))
+    amplitudes = np.resize(amplitude, len(centre))
     for joint in range(len(centre)):
         down, up = np.minimum(amplitudes[joint], np.abs(limits[joint] - centre[joint]))
         times, levels = [0.0], [float(centre[joint])]

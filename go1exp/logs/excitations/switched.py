@@ -58,62 +58,40 @@ def steps(
     duration = check(t, centre, limits)
     joints = len(centre)
     small, wide = (_kept_free(a, centre, limits, overshoot) for a in (amplitude, large))
-    edges = _Edges(centre)
+    edges = [[(0.0, float(c))] for c in centre]  # when each target jumps, s, and to which angle, rad
     now, turns = settle, _turns(rng, joints, at_once)
+
+    def jump(group: list[int], angles: np.ndarray) -> None:
+        for joint in group:
+            edges[joint].append((now, float(angles[joint])))
+
     while now <= duration:
         end = now + rng.uniform(*mixed)
-        edges.add_ordinary(rng, now, end, small, hold)
+        for joint, own in enumerate(edges):
+            own += _ordinary(rng, now, end, small[0][joint], small[1][joint], hold)
+            own.append((end, float(centre[joint])))
         now = end + rng.uniform(*turn)
         group, side = next(turns), rng.choice((-1.0, 1.0))
         for sign in (side, -side):
-            edges.add_jump(now, group, wide[0] + sign * wide[1])
+            jump(group, wide[0] + sign * wide[1])
             now += rng.uniform(*turn)
-        edges.add_jump(now, group, centre)
+        jump(group, centre)
         now += rng.uniform(*turn)
-    return always_on(np.clip(edges.targets(t - t[0]), limits[:, 0], limits[:, 1]), "suspended")
+    target = np.empty((len(t), joints))
+    for joint, own in enumerate(edges):
+        times, levels = np.array(own).T
+        target[:, joint] = levels[np.searchsorted(times, t - t[0], side="right") - 1]
+    return always_on(np.clip(target, limits[:, 0], limits[:, 1]), "suspended")
 
 
-class _Edges:
-    """The instants at which the target of each joint jumps, s, and the angle it jumps to, rad."""
-
-    def __init__(self, centre: np.ndarray) -> None:
-        """Start with every joint at its ``centre`` (J,), rad."""
-        self._centre = centre
-        self._edges: list[list[tuple[float, float]]] = [[(0.0, float(c))] for c in centre]
-
-    def add_ordinary(
-        self,
-        rng: np.random.Generator,
-        begin: float,
-        end: float,
-        swing: tuple[np.ndarray, np.ndarray],
-        hold: tuple[float, float],
-    ) -> None:
-        """Let every joint jump at its own random times from ``begin`` to ``end``, and then back to its centre.
-
-        ``swing`` is the middle and the half range (J,) of the levels; ``hold`` the shortest and longest time at one.
-        """
-        middle, half = swing
-        for joint, edges in enumerate(self._edges):
-            at = begin + rng.uniform(0, hold[1])
-            while at < end:
-                level = middle[joint] + half[joint] * rng.uniform(-1, 1)
-                edges.append((at, float(level)))
-                at += rng.uniform(*hold)
-            edges.append((end, float(self._centre[joint])))
-
-    def add_jump(self, at: float, joints: list[int], angles: np.ndarray) -> None:
-        """Let ``joints`` jump to their ``angles`` (J,) at one instant."""
-        for joint in joints:
-            self._edges[joint].append((at, float(angles[joint])))
-
-    def targets(self, t: np.ndarray) -> np.ndarray:
-        """Return the angles in force at ``t`` (T,): (T, J)."""
-        target = np.empty((len(t), len(self._edges)))
-        for joint, edges in enumerate(self._edges):
-            times, levels = np.array(edges).T
-            target[:, joint] = levels[np.searchsorted(times, t, side="right") - 1]
-        return target
+def _ordinary(
+    rng: np.random.Generator, begin: float, end: float, middle: float, half: float, hold: tuple[float, float]
+) -> Iterator[tuple[float, float]]:
+    """Yield random times from ``begin`` to ``end``, s, with levels up to ``half`` from ``middle``, rad."""
+    at = begin + rng.uniform(0, hold[1])
+    while at < end:
+        yield at, float(middle + half * rng.uniform(-1, 1))
+        at += rng.uniform(*hold)
 
 
 def _kept_free(
@@ -172,9 +150,8 @@ def torque_off(
     enabled = np.ones(len(t), dtype=bool)
     side = np.empty(0)
     while True:
-        side = (
-            -side if len(times) % 8 == 5 else rng.choice((-1.0, 1.0), len(centre))
-        )  # every second swing is the mirror image of the one before
+        # every second swing is the mirror image of the one before
+        side = -side if len(times) % 8 == 5 else rng.choice((-1.0, 1.0), len(centre))
         pose = middle + side * half * rng.uniform(0.6, 1, len(centre))
         free = rng.uniform(*off)
         leave = times[-1] + move + settle

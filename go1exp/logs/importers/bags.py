@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,8 +15,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from go1exp.base.wording import counted
 from go1exp.config.schema.registry import explain
 from go1exp.logs.importers.series import between, one_motion, taking_turns
-from go1exp.logs.importers.source import beginning, joint_columns, kind, without_repeats
-from go1exp.logs.recording import RecordingError
+from go1exp.logs.importers.source import beginning, kind, without_repeats
+from go1exp.logs.recording import RecordingError, joint_columns
 from go1exp.robot import JOINTS
 
 EXTRA = 'pip install "go1exp[logs]"'
@@ -133,35 +133,28 @@ def _readable(path: Path, states: Mapping[str, Sequence[State]]) -> str:
 
 def _topics_until_the_cut(path: Path, topics: Container[str], add: Callable[[Any, Any, Any], None]) -> set[str]:
     """Return all topics up to where a log cannot be read any further, and ``add`` the messages of ``topics``."""
-    from mcap.stream_reader import StreamReader
-
-    present = set()
-    with path.open("rb") as file:
-        for schema, channel, message in _until_the_cut(StreamReader(file, validate_crcs=True).records):
-            present.add(channel.topic)
-            if channel.topic in topics:
-                add(schema, channel, message)
-    return present
-
-
-def _until_the_cut(records: Iterator[Any]) -> Iterator[tuple[Any, Any, Any]]:
-    """Yield schema, channel and message up to where a log cannot be read any further."""
     from mcap.records import Channel, Message, Schema
+    from mcap.stream_reader import StreamReader
 
     schemas: dict[int, Any] = {}
     channels: dict[int, Any] = {}
-    while True:
-        try:
-            record = next(records)
-        except Exception:  # (the end, or whatever a reader or decompressor meets in a damaged file)
-            return
-        if isinstance(record, Schema):
-            schemas[record.id] = record
-        elif isinstance(record, Channel):
-            channels[record.id] = record
-        elif isinstance(record, Message) and record.channel_id in channels:
-            channel = channels[record.channel_id]
-            yield schemas.get(channel.schema_id), channel, record
+    present: set[str] = set()
+    with path.open("rb") as file:
+        records = StreamReader(file, validate_crcs=True).records
+        while True:
+            try:
+                record = next(records)
+            except Exception:  # (the end, or whatever a reader or decompressor meets in a damaged file)
+                return present
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Message) and record.channel_id in channels:
+                channel = channels[record.channel_id]
+                present.add(channel.topic)
+                if channel.topic in topics:
+                    add(schemas.get(channel.schema_id), channel, record)
 
 
 def _decoder(where: str, factory: Any, schema: Any, encoding: str, wanted: Kind) -> Callable[[bytes], object]:

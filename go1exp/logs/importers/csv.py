@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -212,7 +211,7 @@ def _recordings(
                 if left := len(rows) - len(kept):
                     remarks.append(f"{counted(left, 'row')} with the time of the row before: left out.")
                 rows = kept
-            check_clock(where, channels["t"][rows], cells[rows], clock.column, partial(_place, table, rows))
+            check_clock(where, channels["t"][rows], cells[rows], clock.column, table.place, rows)
             remarks.append(f"t = 0 is {cells[rows[0]]} in the column {clock.column!r}.")
             series = {key: values[rows] for key, values in channels.items()}
             series["t"] = series["t"] - series["t"][0]
@@ -237,10 +236,6 @@ def _remarks(table: Table, wanted: Mapping[str, str], notes: str) -> list[str]:
     if table.units:
         remarks.append(f"Units of the line below the names: {', '.join(filter(None, table.units.values()))}.")
     return remarks
-
-
-def _place(table: Table, rows: np.ndarray, k: int) -> str:
-    return table.place(int(rows[k]))
 
 
 def _with_units(path: Path, mapping: Mapping[str, Column], units: Mapping[str, str]) -> dict[str, Column]:
@@ -294,9 +289,8 @@ def _problems(mapping: Mapping[str, Column], joints: tuple[str, ...], rate_hz: f
         elif column.scale == 0:
             wrong.append(f"{at}.scale = {column.scale}: must not be 0")
     for name in [f"q_{j}" for j in joints if f"q_{j}" in mapping]:
-        tail = next(
-            (j for j in joints if name.endswith(f"_{j}") and name != f"q_{j}"), ""
-        )  # q_targt_knee beside q_knee
+        # q_targt_knee beside q_knee
+        tail = next((j for j in joints if name.endswith(f"_{j}") and name != f"q_{j}"), "")
         if tail and (close := nearest(name.removesuffix(f"_{tail}"), [q for q in JOINT_QUANTITIES if "_" in q], 1)):
             return [*wrong, f"{PATH}.columns.{name}: unknown channel; did you mean '{close[0]}_{tail}'?"]
     for quantity in JOINT_QUANTITIES:

@@ -10,8 +10,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from go1exp.config.schema.registry import Positive, explain, importer
-from go1exp.logs.importers.source import LEVEL, Arrays, columns, files, joint_columns, load_npz, recording, reorder
-from go1exp.logs.recording import VECTORS, Quaternion, Recording, RecordingError
+from go1exp.logs.importers.source import LEVEL, Arrays, files, load_npz, recording
+from go1exp.logs.recording import VECTORS, Quaternion, Recording, RecordingError, columns, joint_columns
 from go1exp.robot import JOINT_KINDS, JOINTS
 
 # ---------------------------------------- dfki-ric-underactuated-lab/double_pendulum, BSD 3-Clause
@@ -57,7 +57,7 @@ def _double_pendulum(path: Path, design: str | None) -> Recording:
     if followed:
         names["q_target"] = "pos_des"
     for quantity, name in names.items():
-        channels |= joint_columns(quantity, SHOULDER_ELBOW, _pair(data, name))
+        channels |= {f"{quantity}_{joint}": data.numbers(f"{name}{k}") for k, joint in enumerate(SHOULDER_ELBOW, 1)}
     return recording(
         path,
         "ak80_double_pendulum",
@@ -70,13 +70,6 @@ def _double_pendulum(path: Path, design: str | None) -> Recording:
         episode=f"ak80_{design.lower()}_{path.stem}",
         notes=PENDULUM_NOTES.format(design=design) + (FOLLOWED if followed else OPEN_LOOP),
     )
-
-
-def _pair(data: Arrays, name: str) -> np.ndarray:
-    first, second = data.numbers(f"{name}1"), data.numbers(f"{name}2")
-    if len(first) != len(second):
-        raise RecordingError(f"{data.path}: {name}1 has {len(first)} values, {name}2 has {len(second)}")
-    return np.stack([first, second], axis=1)
 
 
 def _design(path: Path) -> str:
@@ -95,9 +88,10 @@ MOST_LINES = 3  # most problems of a file that are reported: a missing key is mi
 PENDULUM = "pendulum"
 
 SERVO_NOTES = (
-    "{mass:g} kg at {length:g} m on the horn of an {motor}; the mass of the arm itself is not given. "
-    "Position gain {gain:g} in the firmware's own unit, not N m/rad. Supply {low:g} to {high:g} V ({vin:g} V nominal), "
-    "case {cold:g} to {warm:g} C. Torque is not measured: the actuator's raw word 'load' has no unit and is left out. "
+    "{log.mass:g} kg at {log.length:g} m on the horn of an {log.motor}; the mass of the arm itself is not given. "
+    "Position gain {log.kp:g} in the firmware's own unit, not N m/rad. "
+    "Supply {volts[0]:g} to {volts[1]:g} V ({log.vin:g} V nominal), case {case[0]:g} to {case[1]:g} C. "
+    "Torque is not measured: the actuator's raw word 'load' has no unit and is left out. "
     "The angle counts from hanging down."
 )
 
@@ -152,7 +146,7 @@ def _servo_pendulum(path: Path) -> Recording:
     if not log.entries:
         raise RecordingError(f"{path}: entries: must not be empty")
     table = {key: np.array([getattr(row, key) for row in log.entries]) for key in _ServoRow.model_fields}
-    volts, case = table["input_volts"], table["temp"]
+    volts, case = ((table[name].min(), table[name].max()) for name in ("input_volts", "temp"))
     channels = {
         "t": table["timestamp"],
         f"q_{PENDULUM}": table["position"],
@@ -169,17 +163,7 @@ def _servo_pendulum(path: Path) -> Recording:
         base="fixed",
         base_quat=LEVEL,
         excitation=log.trajectory,
-        notes=SERVO_NOTES.format(
-            mass=log.mass,
-            length=log.length,
-            motor=log.motor,
-            gain=log.kp,
-            vin=log.vin,
-            low=volts.min(),
-            high=volts.max(),
-            cold=case.min(),
-            warm=case.max(),
-        ),
+        notes=SERVO_NOTES.format(log=log, volts=volts, case=case),
     )
 
 
@@ -237,6 +221,9 @@ def _arm(path: Path, base_quat: Quaternion) -> Recording:
 THEIR_JOINTS = tuple(f"{leg}_{kind}" for leg in ("FL", "FR", "RL", "RR") for kind in JOINT_KINDS)
 """Order of the joints in both sources of quadrupeds."""
 
+ORDER = [THEIR_JOINTS.index(name) for name in JOINTS]
+"""The index that puts their joints into our order."""
+
 # ---------------------------------------- mass2010chromium/walk-these-ways, MIT
 
 KP = 20.0  # position gain the source states, N m/rad
@@ -273,10 +260,9 @@ def _walk(path: Path) -> Recording:
     data = load_npz(path)
     _check_gains(data)
     t = data.numbers("t")
-    order = reorder(THEIR_JOINTS, JOINTS)
     channels = {"t": t}
     for quantity, key in (("q", "q"), ("qd", "dq"), ("q_target", "q_target")):
-        channels |= joint_columns(quantity, JOINTS, data.numbers(key, len(JOINTS))[:, order])
+        channels |= joint_columns(quantity, JOINTS, data.numbers(key, len(JOINTS))[:, ORDER])
     channels |= columns(VECTORS["imu_gyro"], data.numbers("gyro", 3))
     channels |= columns(VECTORS["imu_acc"], data.numbers("accel", 3))
     xyzw = Rotation.from_euler("xyz", data.numbers("rpy", 3)).as_quat()
@@ -338,11 +324,10 @@ def go2_in_air(path: Path, *, rate_hz: Positive = 200.0, base_quat: Quaternion =
 def _in_air(path: Path, rate_hz: float, base_quat: Quaternion) -> Recording:
     table = _read(path)
     numbers = range(len(JOINTS))
-    order = reorder(THEIR_JOINTS, JOINTS)
     channels = {"t": np.arange(len(next(iter(table.values())))) / rate_hz}
     for quantity, name in (("q", "jpos{}"), ("qd", "jvel{}"), ("q_target", "jpos{}_des")):
         block = np.stack([_column(path, table, name.format(i)) for i in numbers], axis=1)
-        channels |= joint_columns(quantity, JOINTS, block[:, order])
+        channels |= joint_columns(quantity, JOINTS, block[:, ORDER])
     return recording(
         path,
         "go2_in_air",

@@ -11,8 +11,8 @@ from pydantic import AliasChoices, Field
 
 import go1exp.logs.importers.bags as bags
 from go1exp.config.schema.registry import NonNegative, Positive, importer
-from go1exp.logs.importers.source import columns, files, recording
-from go1exp.logs.recording import FOOT_FORCE, VECTORS, Quaternion, Recording, RecordingError
+from go1exp.logs.importers.source import files, recording
+from go1exp.logs.recording import FOOT_FORCE, VECTORS, Quaternion, Recording, RecordingError, columns
 from go1exp.robot import JOINTS, LEGS
 
 PACKAGES = ("unitree_go", "ros2_unitree_legged_msgs", "unitree_legged_msgs")
@@ -107,27 +107,15 @@ def mcap_joint_state(
         RecordingError: if the extra is not installed, the log is damaged, or a topic or joint is missing.
     """
     topics = {topic: JOINT_STATE for topic in (state_topic, command_topic) if topic is not None}
+    about: dict[str, Any] = {"robot": robot, "base": base, "base_quat": base_quat, "excitation": excitation}
+    about |= {"kp": kp, "kd": kd, "tau_limit": tau_limit}
     recordings = []
     for file in files(path, "*.mcap"):
         states, notes = bags.read(file, topics, cut)
         names = joints or bags.joints_of(states[state_topic], states.get(command_topic or "", ()))
         channels, _ = bags.channels(file, states, state_topic, command_topic, names, drop_repeats, notes)
-        recordings.append(
-            recording(
-                file,
-                "mcap_joint_state",
-                channels,
-                robot=robot,
-                joints=names,
-                base=base,
-                base_quat=base_quat,
-                kp=kp,
-                kd=kd,
-                tau_limit=tau_limit,
-                excitation=excitation,
-                notes=" ".join(notes),
-            )
-        )
+        about |= {"joints": names, "notes": " ".join(notes)}
+        recordings.append(recording(file, "mcap_joint_state", channels, **about))
     return recordings
 
 

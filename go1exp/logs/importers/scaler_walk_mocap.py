@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from go1exp.config.schema.registry import Positive, importer
-from go1exp.logs.importers.source import Arrays, columns, files, joint_columns, load_npz, recording
-from go1exp.logs.recording import FOOT_FORCE, VECTORS, Recording, RecordingError
+from go1exp.logs.importers.source import Arrays, files, load_npz, recording
+from go1exp.logs.recording import FOOT_FORCE, VECTORS, Recording, RecordingError, columns, joint_columns
 from go1exp.robot import GRAVITY
 
 if TYPE_CHECKING:
@@ -92,12 +92,16 @@ def scaler_walk_mocap(
 
 
 def _one(path: Path, tolerance: float, resync: bool, levelling: float | None) -> Recording:
+    from go1exp.robot.attitude import levelled, vertical  # slow to import, and settings are checked first
+
     data, rows, row_notes = open_run(path)
     t, q, gyro = (data.numbers("t")[rows], data.numbers("joint_pos", 4, 3)[rows], data.numbers("gyro_body", 3)[rows])
     acc = data.numbers("accel_body", 3)[rows]
     channels = {"t": t, **joint_columns("q", JOINTS, q.reshape(len(q), -1))}
     channels |= columns(VECTORS["imu_gyro"], gyro)
-    channels |= columns(VECTORS["imu_acc"], acc if levelling is None else specific_force(t, gyro, acc, levelling))
+    if levelling is not None:  # the sign of everything except gravity is wrong (see ``TURNED``)
+        acc = 2 * GRAVITY * vertical(levelled(t, gyro, acc, seconds=levelling)) - acc
+    channels |= columns(VECTORS["imu_acc"], acc)
     forces, force_notes = _foot_forces(data, rows)
     truth, truth_notes = _truth(data, t, gyro, tolerance, resync)
     return recording(
@@ -134,13 +138,6 @@ def open_run(path: Path) -> tuple[Arrays, np.ndarray, list[str]]:
         raise RecordingError(f"{path}: fewer than two rows have finite joints and IMU and a time that advances")
     lost = int((~sound).sum())
     return data, np.flatnonzero(sound), [f"{lost} rows were not finite or not newer and are left out."] if lost else []
-
-
-def specific_force(t: np.ndarray, gyro: np.ndarray, reported: np.ndarray, seconds: float) -> np.ndarray:
-    """Correct the sign of everything except gravity in the reported acceleration, ``(T, 3)`` m/s2 (see ``TURNED``)."""
-    from go1exp.robot.attitude import levelled, vertical
-
-    return 2 * GRAVITY * vertical(levelled(t, gyro, reported, seconds=seconds)) - reported
 
 
 def _foot_forces(data: Arrays, rows: np.ndarray) -> tuple[dict[str, np.ndarray], list[str]]:

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from go1exp import __version__
 from go1exp.base.wording import counted
 from go1exp.config.schema.registry import explain
-from go1exp.logs.recording import KEY, Meta, Recording, RecordingError, joint_channels, problems
+from go1exp.logs.recording import KEY, Meta, Recording, RecordingError, problems, stop
 from go1exp.robot.go1_fields import TORQUE_NOTE, in_torque_steps
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)  # attitude of an upright base, w-x-y-z
@@ -124,8 +124,13 @@ def _label(value: float | str) -> str:
     return re.sub(r"[^\w.-]+", "_", str(int(value) if whole else value)).strip("_") or "_"
 
 
-def check_clock(where: str, t: np.ndarray, cells: np.ndarray, column: str, place: Callable[[int], str]) -> None:
-    """Raise RecordingError if the time ``t`` (T,), s, does not increase; with its place, its cell, and what to do."""
+def check_clock(
+    where: str, t: np.ndarray, cells: np.ndarray, column: str, place: Callable[[int], str], rows: np.ndarray
+) -> None:
+    """Raise RecordingError if the time ``t`` (T,), s, does not increase; with its place, its cell, and what to do.
+
+    ``rows`` (T,) are those of the file, of which ``place`` says where each stands.
+    """
     if len(t) < 2:
         raise RecordingError(f"{where}: has {counted(len(t), 'row')} of numbers; at least 2 are needed")
     steps = np.diff(t)
@@ -133,9 +138,8 @@ def check_clock(where: str, t: np.ndarray, cells: np.ndarray, column: str, place
     if not back.size:
         return
     k = int(back[0])
-    rows = counted(back.size, "such row")
-    where = f"{where}: column {column!r} (for t): must increase strictly, but {place(k + 1)} has {cells[k + 1]} after"
-    where += f" {cells[k]} ({rows})"
+    where = f"{where}: column {column!r} (for t): must increase strictly, but {place(int(rows[k + 1]))} has "
+    where += f"{cells[k + 1]} after {cells[k]} ({counted(back.size, 'such row')})"
     if bits := overflow(cells):
         raise RecordingError(f"{where}; it is a counter of {bits} bits that overflows: add {2**bits} from there on")
     if steps.max() <= 0 and t[-1] < t[0]:
@@ -202,9 +206,8 @@ def load_npz(path: Path) -> Arrays:
                 raise ValueError("one bare array")
             return Arrays(path, {key: archive[key] for key in archive.files})
     except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-        reason = (
-            "no zip archive of them" if "pickle" in str(error) else error
-        )  # NumPy's message advises to allow pickles
+        # NumPy's message advises to allow pickles
+        reason = "no zip archive of them" if "pickle" in str(error) else error
         raise RecordingError(f"{path}: not a whole .npz of plain arrays ({reason})") from error
 
 
@@ -278,22 +281,6 @@ def rate(path: Path, t: np.ndarray) -> float:
     return float(f"{1 / step:.{RATE_DIGITS}g}")
 
 
-def columns(names: Iterable[str], values: np.ndarray) -> dict[str, np.ndarray]:
-    """Split ``(T, K)`` into K named columns."""
-    return {name: np.ascontiguousarray(values[:, i]) for i, name in enumerate(names)}
-
-
-def joint_columns(quantity: str, joints: Iterable[str], values: np.ndarray) -> dict[str, np.ndarray]:
-    """Split ``(T, J)`` into the columns of one quantity."""
-    return columns(joint_channels(quantity, joints), values)
-
-
-def reorder(theirs: Iterable[str], ours: Iterable[str]) -> list[int]:
-    """Return the index that puts the joints of a source into our order, by name."""
-    place = {name: i for i, name in enumerate(theirs)}
-    return [place[name] for name in ours]
-
-
 def recording(path: Path, importer: str, channels: dict[str, np.ndarray], **about: Any) -> Recording:
     """Build a recording and check it; ``about`` are further fields of ``Meta``.
 
@@ -310,13 +297,11 @@ def recording(path: Path, importer: str, channels: dict[str, np.ndarray], **abou
     try:
         meta = Meta(**(known | about))
     except ValidationError as error:
-        lines = explain(error, "metadata", Meta.__dataclass_fields__)
-        raise RecordingError("\n".join(f"{path}: {line}" for line in lines)) from error
+        stop(path, explain(error, "metadata", Meta.__dataclass_fields__))
+        raise  # not reached: an error has lines
     result = Recording(meta, channels, path)
     torques = [values for name, values in channels.items() if name.startswith("tau_est_")]
     if meta.robot == "go1" and torques and in_torque_steps(np.concatenate(torques)):
         result = replace(result, meta=replace(meta, notes="; ".join(filter(None, (meta.notes, TORQUE_NOTE)))))
-    wrong = problems(result)
-    if wrong:
-        raise RecordingError("\n".join(f"{path}: {line}" for line in wrong))
+    stop(path, problems(result))
     return result

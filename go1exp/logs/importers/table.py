@@ -90,14 +90,10 @@ def read(path: Path, wanted: Mapping[str, str], layout: Layout, labels: str | No
     Raises:
         RecordingError: if it is no table, lacks a column, or holds what is no number; with every such column.
     """
-    units: dict[str, str] = {}
-    if is_parquet(path):
-        present = list(parquet_names(path))
-    else:
-        given = _text_names(path, layout)
-        units = _units(path, layout, given)
-        layout = replace(layout, units=bool(units))
-        present = list(given)
+    given = None if is_parquet(path) else _text_names(path, layout)
+    units = {} if given is None else _units(path, layout, given)
+    layout = replace(layout, units=bool(units))
+    present = list(parquet_names(path) if given is None else given)
     lacking = [name for name in wanted if name not in present]
     hint = _question(present[0], layout) if len(present) == 1 else _no_names(present, layout)
     # Where the delimiter is another one, or names are missing, no name is right, and one complaint will do.
@@ -105,11 +101,12 @@ def read(path: Path, wanted: Mapping[str, str], layout: Layout, labels: str | No
     existing = [name for name in wanted if name in present]
 
     def place(row: int) -> str:
-        return f"row {row}" if is_parquet(path) else f"line {line_of(path, row, layout)}"
+        return f"row {row}" if given is None else f"line {line_of(path, row, layout)}"
 
-    table = (
-        parquet_columns(path, existing) if is_parquet(path) else _text(path, {n: given[n] for n in existing}, layout)
-    )
+    if given is None:
+        table = parquet_columns(path, existing)
+    else:
+        table = _text(path, {name: given[name] for name in existing}, layout)
     values: dict[str, np.ndarray] = {}
     other_sign: list[tuple[str, _NoNumber]] = []
     for name in existing:

@@ -11,7 +11,7 @@ from pydantic import ConfigDict, Field
 
 from go1exp import robot
 from go1exp.config.schema.registry import STRICT, Fraction, NonNegative, Positive
-from go1exp.logs.recording import VECTORS, joint_channels
+from go1exp.logs.recording import FOOT_FORCE, VECTORS, columns, joint_columns
 
 
 @dataclass(frozen=True)
@@ -89,25 +89,23 @@ def log(true: Mapping[str, np.ndarray], config: SensorConfig, rng: np.random.Gen
     channels: dict[str, np.ndarray] = {"t": np.arange(rows) * dt + late}
     for name in ("q", "qd", "tau_est"):
         measured = _with_errors(true[name], getattr(config, name), rng)
-        channels |= dict(zip(joint_channels(name, robot.JOINTS), measured.T, strict=True))
-    channels |= dict(zip(joint_channels("q_target", robot.JOINTS), true["q_target"].T, strict=True))
+        channels |= joint_columns(name, robot.JOINTS, measured)
+    channels |= joint_columns("q_target", robot.JOINTS, true["q_target"])
     for name in ("gyro", "acc"):
-        channels |= dict(
-            zip(VECTORS[f"imu_{name}"], _with_errors(true[name], getattr(config, name), rng).T, strict=True)
-        )
+        channels |= columns(VECTORS[f"imu_{name}"], _with_errors(true[name], getattr(config, name), rng))
     # The error is a small rotation in the body's axes, so that it does not depend on the attitude.
     error = Rotation.from_rotvec(config.attitude.noise * rng.standard_normal((rows, 3)))
     attitude = Rotation.from_quat(true["quat"], scalar_first=True) * error
     quat = _quantised(attitude.as_quat(canonical=True, scalar_first=True), config.attitude)
-    channels |= dict(zip(VECTORS["imu_quat"], quat.T, strict=True))
+    channels |= columns(VECTORS["imu_quat"], quat)
     forces = np.maximum(_with_errors(true["foot_force"], config.foot_force, rng), 0.0)
-    channels |= {f"foot_force_{leg}": forces[:, k] for k, leg in enumerate(robot.LEGS)}
+    channels |= columns((FOOT_FORCE + leg for leg in robot.LEGS), forces)
     if not true["torque_enable"].all():
         channels["torque_enable"] = true["torque_enable"].astype(bool)
     if config.truth:
         for name in ("base_pos", "base_quat", "base_lin_vel", "base_ang_vel"):
             if name in true:
-                channels |= dict(zip(VECTORS[name], true[name].T, strict=True))
+                channels |= columns(VECTORS[name], true[name])
     # Samples are lost after everything else is drawn: the noise of the others does not depend on the loss.
     kept = rng.random(rows) >= config.dropped
     kept[0] = True

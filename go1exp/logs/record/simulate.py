@@ -21,7 +21,7 @@ from go1exp.config.schema.physics import MUJOCO_CONTACT, BackendConfig, ContactC
 from go1exp.config.schema.registry import ConfigError, Term
 from go1exp.logs.record.plan import Episode
 from go1exp.logs.record.sensors import SensorConfig, log
-from go1exp.logs.recording import Meta, Recording
+from go1exp.logs.recording import Meta, Quaternion, Recording
 from go1exp.robot.config import RobotConfig
 from go1exp.sim.effects.base import Measured
 from go1exp.sim.effects.rules import has_gains, nested_actuators, on_mount
@@ -150,7 +150,13 @@ def _play_together(
     tape = Tape(plant, per_sample, len(episodes[0].motion.target))
     _follow_motions(plant, tape, episodes, sensors.rate_hz, per_sample, on_step)
     tape.stop()
-    return [_recording(rig, sensors, e, tape.true(k)) for k, e in enumerate(episodes)]
+    recordings = []
+    for k, e in enumerate(episodes):
+        about = {"contact": rig.contact or MUJOCO_CONTACT, "excitation": e.excitation, "episode": e.name}
+        about |= {"kp": (e.kp,) * robot.NUM_JOINTS, "kd": (e.kd,) * robot.NUM_JOINTS, "repeat_of": e.repeat_of}
+        held = None if e.hang is None else held_quat(e.hang)
+        recordings.append(_recording(rig, sensors, tape.true(k), e.seed, held, **about))
+    return recordings
 
 
 def _build_plant(rig: Rig, episodes: Sequence[Episode], seed: int) -> Plant:
@@ -221,22 +227,16 @@ def _follow_motions(
             on_step(row + 1, rows)
 
 
-def _recording(rig: Rig, sensors: SensorConfig, episode: Episode, true: Mapping[str, np.ndarray]) -> Recording:
-    return Recording(
-        meta(
-            rig.robot,
-            sensors,
-            contact=rig.contact or MUJOCO_CONTACT,
-            base="floating" if episode.hang is None else "fixed",
-            base_quat=None if episode.hang is None else held_quat(episode.hang),
-            kp=(episode.kp,) * robot.NUM_JOINTS,
-            kd=(episode.kd,) * robot.NUM_JOINTS,
-            excitation=episode.excitation,
-            episode=episode.name,
-            repeat_of=episode.repeat_of,
-        ),
-        log(true, sensors, np.random.default_rng(episode.seed)),
-    )
+def _recording(
+    rig: Rig,
+    sensors: SensorConfig,
+    true: Mapping[str, np.ndarray],
+    seed: int | Sequence[int],
+    held: Quaternion | None,
+    **about: Any,
+) -> Recording:
+    base: dict[str, Any] = {"base": "floating" if held is None else "fixed", "base_quat": held}
+    return Recording(meta(rig.robot, sensors, **base, **about), log(true, sensors, np.random.default_rng(seed)))
 
 
 def meta(config: RobotConfig, sensors: SensorConfig, **changes: Any) -> Meta:
@@ -308,19 +308,9 @@ def play_policy(rig: Rig, walk: Walk, sensors: SensorConfig, seed: int, on_step:
     recordings = []
     for k, name in enumerate(walk.names):
         true = {key: values[: rows[k]] for key, values in tape.true(k).items()}
-        about = meta(
-            rig.robot,
-            sensors,
-            contact=core.task.contact,
-            base="floating" if held is None else "fixed",
-            base_quat=held,
-            kp=configured(rig.actuator, "kp"),
-            kd=configured(rig.actuator, "kd"),
-            excitation=walk.excitation,
-            episode=name,
-            repeat_of=None,
-        )
-        recordings.append(Recording(about, log(true, sensors, np.random.default_rng([seed, k]))))
+        about = {"contact": core.task.contact, "excitation": walk.excitation, "episode": name, "repeat_of": None}
+        about |= {gain: configured(rig.actuator, gain) for gain in ("kp", "kd")}
+        recordings.append(_recording(rig, sensors, true, [seed, k], held, **about))
     return recordings
 
 
