@@ -271,7 +271,6 @@ class DeviceUpdate:
         return step
 
     def _recorded(self, work: Callable[[], None], stream: torch.cuda.Stream) -> Callable[[], None]:
-        """Record ``work`` as one CUDA graph and return the replay."""
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
             work()
@@ -279,7 +278,6 @@ class DeviceUpdate:
 
 
 def _moments(state: Mapping[Tensor, dict[str, Tensor]]) -> list[Tensor]:
-    """Return all tensors of Adam's state: moments and counts of steps."""
     return [value for of_parameter in state.values() for value in of_parameter.values()]
 
 

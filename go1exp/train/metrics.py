@@ -227,7 +227,6 @@ class CsvWriter(KVWriter):
                 warnings.warn(f"{path}: rows of {iteration - kept} of {iteration} iterations are missing", stacklevel=2)
 
     def _cut(self, name: str, path: Path, iteration: int) -> int:
-        """Leave the whole rows up to ``iteration``; return their number."""
         rows: list[list[str]] = []
         with path.open(newline="", encoding="utf-8", errors="replace") as file, contextlib.suppress(csv.Error):
             rows = list(csv.reader(file))

@@ -142,7 +142,6 @@ def _meta(container: Mapping[str, object]) -> dict[str, object]:
 
 @cache
 def _installed() -> dict[str, str]:
-    """Return the version of each package that is installed, by name."""
     packages = [(d.name, d.version) for d in importlib.metadata.distributions()]
     return dict(sorted(packages, key=lambda pair: pair[0]))
 
@@ -273,7 +272,6 @@ def _missing_package(run: Path, record: Mapping[str, Any]) -> list[str]:
 
 
 def _used(container: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield group and name of every term in a configuration."""
     for group in MANY_TERMS:
         for key, settings in (container.get(group) or {}).items():
             yield REGISTERED_AS.get(group, group), str((settings or {}).get("term", key))
@@ -315,7 +313,6 @@ def _kept_package(plugin: Plugin) -> dict[str, object]:
 
 
 def _version(module: str) -> str | None:
-    """Return the version of the distribution that a module is of, or what the module itself says."""
     root = module.split(".")[0]
     for distribution in importlib.metadata.packages_distributions().get(root, []):
         return importlib.metadata.version(distribution)

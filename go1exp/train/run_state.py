@@ -82,7 +82,6 @@ def in_use(run: Path) -> bool:
 
 
 def _acquired(run: Path) -> BaseFileLock:
-    """Return the lock, taken; raise RunInUse if it is another's."""
     try:
         try:
             lock: BaseFileLock = FileLock(run / LOCK, timeout=0, preserve_lock_file=True)

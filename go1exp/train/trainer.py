@@ -238,7 +238,6 @@ def train_as_member(container: dict[str, object], run: Path, group: Group) -> No
 
 
 def _learn(ppo: AdaptivePPO, config: TrainConfig, logger: Logger) -> None:
-    """Make the iterations that are left."""
     ppo.set_logger(logger)
     left = config.ppo.iterations * config.ppo.num_envs * config.ppo.steps - ppo.num_timesteps
     if left > 0:
@@ -249,7 +248,6 @@ def _learn(ppo: AdaptivePPO, config: TrainConfig, logger: Logger) -> None:
 
 
 def _begun(config: TrainConfig, run: Path, first: Weights | None, group: Group) -> AdaptivePPO:
-    """Return the learner as training begins or goes on with it."""
     ppo = build(config, group)
     latest = group.agreed(checkpoint.load_latest(run)[1].name if group.first and checkpoint.checkpoints(run) else None)
     if latest:
@@ -316,7 +314,6 @@ class _Closing:
 
 
 def _keep(fault: NumericalFault, run: Path) -> None:
-    """Write the moment at which a number was not finite."""
     with opened(run / "fault.npz") as file:
         np.savez(file, allow_pickle=False, **fault.dump)
     write_json(run / "fault.json", {"quantity": fault.quantity, "message": str(fault)}, indent=None)

@@ -228,7 +228,6 @@ def _module(name: str) -> tuple[str, Path | None]:
 
 
 def _keep_active(modules: Collection[str]) -> None:
-    """Put out of force the plugins of other modules."""
     for module in [m for m in _active if m not in modules]:
         for entry in _active.pop(module).entries:
             registry.remove(entry)
@@ -304,7 +303,6 @@ def _import(module: str, name: str, file: Path | None) -> Plugin:
 
 
 def _reason(error: BaseException, module: str, name: str, file: Path | None) -> str:
-    """Return the error of a plugin and its place in one line."""
     if isinstance(error, DuplicateError):
         return str(error)
     if isinstance(error, ModuleNotFoundError) and file is None and module.startswith(str(error.name)):

@@ -101,7 +101,6 @@ class GroupedMLP:
                     self._calls.append((torch.addmm, (out, linear[net], self._x[:, start:stop]), out))
 
     def _add_layers(self, pieces: list[Piece], weights: list[list[Tensor]], work: list[Tensor], spare: Tensor) -> None:
-        """Write down the calls for one block."""
         first, width = pieces[0][1], pieces[-1][2] - pieces[0][1]
         source, depth = self._x[:, first : first + width], len(weights[0])
         for k in range(depth):

@@ -71,7 +71,6 @@ def robot_bytes(task: TaskConfig, robots: int) -> int:
 
 
 def _size(state: object) -> int:
-    """Return the bytes of all tensors in nested dictionaries."""
     if isinstance(state, dict):
         return sum(map(_size, state.values()))
     return state.nbytes if isinstance(state, Tensor) else 0

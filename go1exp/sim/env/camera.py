@@ -111,7 +111,6 @@ def choose_gl() -> str:
 
 
 def _why_not(name: str) -> str:
-    """Return why a GL library does not work on this machine; empty if it does."""
     try:
         done = subprocess.run(
             [sys.executable, "-c", _PROBE.format(name=name)], capture_output=True, text=True, timeout=60
@@ -124,7 +123,6 @@ def _why_not(name: str) -> str:
 
 
 def _contexts(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoco.MjrContext]:
-    """Return an off-screen GL context of that size, made current, and MuJoCo's own in it."""
     name = choose_gl()
     try:
         gl = importlib.import_module(f"mujoco.{name}").GLContext(width, height)

@@ -204,7 +204,6 @@ class Plant:
             self._rotors.follow(self.joint_acceleration())
 
     def _fed_forward(self, command: Tensor, encoder: tuple[Tensor, Tensor], feedforward: Tensor | None) -> Tensor:
-        """Return the actuators' torque for a target, with the torque that is fed forward."""
         if self._fed is None:
             if not takes_feedforward(self.actuator):
                 kind, known = type(self.actuator).__name__, "use actuator=pd, dc_motor, voltage, delay or net"

@@ -282,11 +282,7 @@ class StepTerms:
         )
 
     def _shaped(self, group: str, term: Term, value: Tensor) -> Tensor:
-        """Return what a term gave, if it is one value, or an observation's ``size``, for each robot.
-
-        Raises:
-            ConfigError: if not. One number for all robots would be spread over them without a word.
-        """
+        """Return what a term gave; raise ConfigError unless it is one value, or ``size`` of them, for each robot."""
         if not isinstance(value, Tensor):
             raise ConfigError([f"{group}.{term.key}: gives {type(value).__name__}, must be a tensor"])
         size = (frame_width(term),) if group == "observation" else ()

@@ -136,7 +136,6 @@ def built(engine: PhysicsBackend) -> Built:
 
 
 def _unlike(names: Sequence[str], others: Sequence[str]) -> int:
-    """Return the number of places at which names differ."""
     return sum(a != b for a, b in zip_longest(names, others))
 
 
@@ -157,7 +156,6 @@ def _poses(count: int, spread: float, seed: int) -> np.ndarray:
 
 
 def _put(engine: PhysicsBackend, qpos: np.ndarray, qvel: np.ndarray) -> None:
-    """Put all robots into states given on the host."""
     like = engine.qpos
     engine.applied().zero_()
     mask = torch.ones(engine.num_envs, dtype=torch.bool, device=like.device)

@@ -106,7 +106,6 @@ class PhysxCpu(MujocoCpu):
         return live
 
     def _refresh_fields(self) -> None:
-        """Give PhysX what has changed in the robots' models since the last step."""
         for name, old in self._in_force.items():
             live = self._fields[name]
             rows = (live != old).flatten(1).any(1)
@@ -148,7 +147,6 @@ class PhysxCpu(MujocoCpu):
         self._put(rows)
 
     def _advance(self, rows: Sequence[int]) -> None:
-        """Step those robots, read where they are then, and what their sensors said."""
         every = len(rows) == self.num_envs
         self._batch.forward(None if every else np.asarray(rows))
         before = self.qpos.clone(), self.qvel.clone()
@@ -164,7 +162,6 @@ class PhysxCpu(MujocoCpu):
         self._sense(torch.as_tensor(rows), *before)
 
     def _push(self, rows: Sequence[int]) -> None:
-        """Give the robots the torques and forces of the step."""
         joints = self._out["qfrc_smooth"] + self._out["qfrc_bias"]  # all but gravity and inertia
         torque = np.empty((self.num_envs, len(self._order)), dtype=np.float32)
         torque[:, self._order] = joints[:, -len(self._order) :]
@@ -196,7 +193,6 @@ class PhysxCpu(MujocoCpu):
     # ------------------------------------------------------------------ state
 
     def _put(self, rows: Tensor) -> None:
-        """Give PhysX the state of those rows."""
         joints = len(self._order)
         pairs = torch.stack([self.qpos[:, -joints:], self.qvel[:, -joints:]], 1).float().numpy()
         root = self._root_to_physx().numpy() if self._floating else None
@@ -212,7 +208,6 @@ class PhysxCpu(MujocoCpu):
         return torch.cat([self.qpos[:, :7], self.qvel[:, :3] + torch.linalg.cross(turn, centre), turn], 1)
 
     def _read(self, rows: Sequence[int], robots: list[PhysxRobot]) -> None:
-        """Read the state of those robots into ``qpos`` and ``qvel``."""
         index, joints = torch.as_tensor(rows), len(self._order)
         raw = torch.as_tensor(np.stack([one.read() for one in robots])).double()
         self.qpos[index, -joints:] = raw[:, 13 : 13 + joints][:, self._order]
@@ -294,6 +289,5 @@ class PhysxCpu(MujocoCpu):
 
 
 def _step_all(robots: list[PhysxRobot]) -> None:
-    """Step robots one after the other."""
     for one in robots:
         one.system.step()

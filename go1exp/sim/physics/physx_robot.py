@@ -145,7 +145,6 @@ class PhysxRobot:
     # ------------------------------------------------------------------ construction
 
     def _link(self, body: int) -> physx.PhysxArticulationLinkComponent:
-        """Make one link with its shapes and its joint."""
         model, parent = self._model, int(self._model.body_parentid[body])
         link = physx.PhysxArticulationLinkComponent(self.links[parent - 1] if parent else None)
         link.name = model.body(body).name
@@ -187,7 +186,6 @@ class PhysxRobot:
         hinge.set_drive_properties(0.0, *dry_friction(float(model.dof_frictionloss[dof])))
 
     def _shape(self, geom: int) -> physx.PhysxCollisionShape:
-        """Make a collision shape of a geom."""
         model, size = self._model, self._model.geom_size[geom]
         mu = 2.0 * float(pair_friction(model, geom, model.geom_friction))
         material, turned = physx.PhysxMaterial(mu, mu, 0.0), rotation(model.geom_quat[geom])
