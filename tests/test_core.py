@@ -4,6 +4,7 @@ import dataclasses
 import io
 import math
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -765,6 +766,7 @@ def test_a_state_that_is_not_finite_is_a_fault_of_that_environment(
     getattr(core.backend, field)[1, column] = value
     with pytest.raises(NumericalFault, match=r"is not finite in environment 1 at step 2$"):
         core.check(core.step(torch.zeros(3, 12)))
+    assert list(Path().iterdir()) == []
 
 
 @pytest.mark.parametrize("termination", ["none", "fall"])
@@ -807,6 +809,7 @@ def test_an_action_that_is_not_finite_is_a_fault_that_names_the_action(start_cor
         core.check(core.step(action))
     assert caught.value.quantity == "action"
     assert np.isnan(caught.value.dump["action"]).tolist() == [k == 5 for k in range(12)]
+    assert list(Path().iterdir()) == []
 
 
 def test_an_observation_that_is_not_finite_is_a_fault_even_when_its_episode_ends(
