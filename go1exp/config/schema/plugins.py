@@ -156,11 +156,7 @@ def restored() -> Iterator[None]:
 
 
 def installed() -> list[Plugin]:
-    """Import the packages that offer terms by an entry point, once; return them.
-
-    Raises:
-        ConfigError: one line for each that fails.
-    """
+    """Import, once, the packages that offer terms by an entry point; return them, or raise ConfigError: a line each."""
     global _installed
     if _installed is not None:
         return list(_installed.values())

@@ -20,12 +20,7 @@ T = TypeVar("T")
 
 
 def make_backend(config: BackendConfig, model: Any, sensors: Sensors, num_envs: int) -> PhysicsBackend:
-    """Build the physics engine that the configuration names.
-
-    Raises:
-        go1exp.config.schema.registry.Expected: if its packages are not installed.
-        go1exp.config.schema.registry.ConfigError: if its device is not there.
-    """
+    """Build the configured physics engine; raise Expected without its packages, ConfigError without its device."""
     if isinstance(config, WarpBackend):
         from go1exp.sim.physics.mujoco_warp import MujocoWarp  # its packages are an extra
 
@@ -53,12 +48,8 @@ def free_on(device: torch.device) -> int | None:
 def captured(env: Any, work: Callable[[], T]) -> tuple[Callable[[], None], T]:
     """Record ``work``, which steps ``env`` call by call, as one graph; the runs before that leave no trace in ``env``.
 
-    Args:
-        env: a ``Go1Core`` whose engine can capture, as ``MujocoWarp`` can.
-        work: what is recorded.
-
-    Returns:
-        the replay, and what ``work`` returned, written anew by each replay.
+    ``env`` is a ``Go1Core`` whose engine can capture, as ``MujocoWarp`` can. Returns the replay, and what ``work``
+    returned, written anew by each replay.
     """
     state = env.state_dict()
     recorded: tuple[Callable[[], None], T] = env.backend.capture(work)

@@ -86,11 +86,7 @@ class Check:
 
 
 def require(reference: PhysicsBackend, engine: PhysicsBackend, name: str) -> list[Check]:
-    """Return the checks of an engine that agrees with the reference.
-
-    Raises:
-        Expected: if it does not, with everything that differs in one line.
-    """
+    """Return the checks of an engine that agrees with the reference; else raise Expected with all that differs."""
     checks = compare(reference, engine)
     if failed := [str(check) for check in checks if not check.holds]:
         raise Expected(
