@@ -431,7 +431,6 @@ def test_every_setting_of_a_verb_can_be_given_on_the_command_line(verb: str) -> 
 
 
 def accepted(verb: str, word: str) -> bool:
-    """Whether a verb takes one setting."""
     try:
         compose(verb, [word])
     except (HydraException, ValueError):

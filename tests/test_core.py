@@ -17,7 +17,6 @@ from torch.testing import assert_close
 
 from go1exp import robot
 from go1exp.config.schema.registry import Entry, Term
-from go1exp.mdp.types import StepResult
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.faults import NumericalFault
@@ -48,13 +47,9 @@ def actions(n: int, steps: int, scale: float = 1.5, seed: int = 0) -> Tensor:
     return torch.as_tensor(np.random.default_rng(seed).normal(0.0, scale, (steps, n, 12))).float()
 
 
-def as_dict(result: StepResult) -> dict[str, Tensor]:
-    return {f.name: getattr(result, f.name) for f in dataclasses.fields(StepResult)}
-
-
 def run(core: Go1Core, inputs: Tensor) -> Iterator[dict[str, Tensor]]:
     for action in inputs:
-        yield {k: v.clone() for k, v in as_dict(core.step(action)).items()}
+        yield {name: value.clone() for name, value in vars(core.step(action)).items()}
 
 
 def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
