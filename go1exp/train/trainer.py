@@ -280,11 +280,9 @@ class _Closing:
         self.logger.record("iteration", ppo.iteration)
         self.logger.record("time/steps_per_s", self.config.ppo.num_envs * steps / (now - self._clock))
         self._clock = now
-        for key, value in ppo.group.metrics(ppo.core.drain_metrics(steps)).items():
-            self.logger.record(key, value)
-        for key, value in ppo.schedule.metrics().items():
-            self.logger.record(key, value)
-        for key, value in (self.evaluation.collect() if self.evaluation else {}).items():
+        figures = ppo.group.metrics(ppo.core.drain_metrics(steps)) | ppo.schedule.metrics()
+        figures |= self.evaluation.collect() if self.evaluation else {}
+        for key, value in figures.items():
             self.logger.record(key, value)
         logged = dict(self.logger.name_to_value)
         if self.progress:
