@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import FrameType, TracebackType
 
@@ -257,22 +257,18 @@ def _begun(config: TrainConfig, run: Path, first: Weights | None, group: Group) 
     return ppo
 
 
+@dataclass
 class _Closing:
     """End of an iteration: metrics, progress, schedule, checkpoint, and the end of training if requested."""
 
-    def __init__(
-        self,
-        config: TrainConfig,
-        run: Path,
-        logger: Logger,
-        progress: Progress | None,
-        asked_to_stop: Callable[[], bool],
-        evaluation: AsyncEvaluation | None = None,
-        stop: EarlyStop | None = None,
-    ) -> None:
-        self.config, self.run, self.logger, self.progress = config, run, logger, progress
-        self.asked_to_stop, self.evaluation, self.stop = asked_to_stop, evaluation, stop
-        self._clock = time.monotonic()
+    config: TrainConfig
+    run: Path
+    logger: Logger
+    progress: Progress | None
+    asked_to_stop: Callable[[], bool]
+    evaluation: AsyncEvaluation | None = None
+    stop: EarlyStop | None = None
+    _clock: float = field(default_factory=time.monotonic)
 
     def __call__(self, ppo: AdaptivePPO) -> None:
         """Close the iteration that ``ppo`` has just completed."""
