@@ -81,7 +81,6 @@ class Browser:
         self.close()
 
     def close(self) -> None:
-        """End Chromium."""
         self._open.close()
         self._process.terminate()
         try:
@@ -105,12 +104,10 @@ class Browser:
                 return dict(answer["result"])
 
     def go(self, address: str) -> None:
-        """Open an address, and wait until there is a page."""
         self.call("Page.navigate", url=address)
         wait_until(lambda: self.evaluate("document.body !== null") is True, 60.0, f"page of {address}")
 
     def evaluate(self, expression: str) -> Any:
-        """Return the value of a JavaScript expression."""
         answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         if "exceptionDetails" in answer:
             raise RuntimeError(str(answer["exceptionDetails"]))

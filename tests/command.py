@@ -126,7 +126,6 @@ class Server:
         assert self._answer(600.0) == "ready"
 
     def close(self) -> None:
-        """End the process and wait for it."""
         self._process.communicate()
 
     def run(

@@ -37,6 +37,14 @@ def rows(values: float | list[float] | np.ndarray) -> Tensor:
     return torch.as_tensor(np.broadcast_to(np.asarray(values, dtype=float), (1, 12)).copy())
 
 
+def assert_joint_by_joint(drive: Any, slow: Callable[[float, float, float, int], float], n: int, atol: float) -> None:
+    """Compare the torques of n robots with ``slow(target, q, qd, joint)``."""
+    rng = np.random.default_rng(0)
+    target, q, qd = rng.normal(size=(n, 12)), rng.normal(size=(n, 12)), rng.normal(0.0, 15.0, (n, 12))
+    expected = [[slow(target[i, j], q[i, j], qd[i, j], j) for j in range(12)] for i in range(n)]
+    np.testing.assert_allclose(drive.torque(*map(torch.as_tensor, (target, q, qd))), expected, rtol=0, atol=atol)
+
+
 # ---------------------------------------------------------------------- dc_motor
 
 
@@ -66,15 +74,10 @@ def test_a_motor_at_a_voltage_is_its_circuit(drives: Drives) -> None:
         limit = [23.7, 23.7, 35.55][joint % 3]
         return max(-limit, min(limit, k * current))
 
-    rng = np.random.default_rng(0)
     make = members("actuator")["voltage"].target
     stall = {**dict.fromkeys(robot.JOINTS, 30.0), "FL_thigh": 18.0}
     drive: Any = make(drives(2), kp=15.0, kd=0.3, stall=stall, speed=25.0, supply=[1.0, 0.8, 1.2])
-    target, q, qd = rng.normal(size=(2, 12)), rng.normal(size=(2, 12)), rng.normal(0.0, 15.0, (2, 12))
-    got = drive.torque(*map(torch.as_tensor, (target, q, qd)))
-    for i in range(2):
-        for j in range(12):
-            assert got[i, j].item() == pytest.approx(slow(target[i, j], q[i, j], qd[i, j], j), abs=1e-9), (i, j)
+    assert_joint_by_joint(drive, slow, 2, 1e-9)
 
 
 def test_a_motor_at_a_voltage_brakes_what_pushes_it_and_has_nothing_left_at_top_speed(drives: Drives) -> None:
@@ -88,21 +91,15 @@ def test_a_motor_at_a_voltage_brakes_what_pushes_it_and_has_nothing_left_at_top_
 
 
 def test_a_dc_motor_is_pd_within_its_line(drives: Drives) -> None:
-    def slow(target: float, q: float, qd: float, joint: int, kp: float, kd: float) -> float:
+    def slow(target: float, q: float, qd: float, joint: int) -> float:
         effort, speed = ([23.7, 23.7, 35.55][joint % 3], [30.1, 30.1, 20.06][joint % 3])
         stall = 33.0 if joint == 4 else effort
         high = max(-effort, min(effort, stall * (1.0 - qd / speed)))
         low = min(effort, max(-effort, -stall * (1.0 + qd / speed)))
-        return max(low, min(high, kp * (target - q) - kd * qd))
+        return max(low, min(high, [20.0, 25.0, 30.0][joint % 3] * (target - q) - 0.6 * qd))
 
-    rng = np.random.default_rng(0)
     drive = motor(drives(50), kp=[20.0, 25.0, 30.0], kd=0.6, stall={"FL_thigh": 33.0})
-    target, q, qd = rng.normal(size=(50, 12)), rng.normal(size=(50, 12)), rng.normal(0.0, 15.0, (50, 12))
-    got = drive.torque(*map(torch.as_tensor, (target, q, qd)))
-    for i in range(50):
-        for j in range(12):
-            expected = slow(target[i, j], q[i, j], qd[i, j], j, [20.0, 25.0, 30.0][j % 3], 0.6)
-            assert got[i, j].item() == pytest.approx(expected, abs=1e-12), (i, j)
+    assert_joint_by_joint(drive, slow, 50, 1e-12)
 
 
 # ---------------------------------------------------------------------- delay
@@ -195,11 +192,8 @@ def shares(make_net: Callable[..., Path]) -> dict[str, Path]:
 def motion(steps: int, n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Target, angle and speed (steps, n, 12)."""
     rng = np.random.default_rng(seed)
-    return (
-        rng.normal(0.0, 0.3, (steps, n, 12)),
-        rng.normal(0.0, 0.3, (steps, n, 12)),
-        rng.normal(0.0, 3.0, (steps, n, 12)),
-    )
+    target, q, qd = (rng.normal(0.0, scale, (steps, n, 12)) for scale in (0.3, 0.3, 3.0))
+    return target, q, qd
 
 
 def played(actuator: Net, series: tuple[np.ndarray, ...], restarts: dict[int, list[int]] | None = None) -> np.ndarray:

@@ -48,7 +48,6 @@ DOCS = Path(__file__).parents[1] / "docs"
 
 
 def groups() -> list[str]:
-    """The groups of conf/train.yaml."""
     defaults = OmegaConf.to_container(OmegaConf.load(CONF / "train.yaml"))["defaults"]  # type: ignore[call-overload,index]
     return [str(group).removeprefix("optional ") for item in defaults if isinstance(item, dict) for group in item]
 

@@ -115,7 +115,6 @@ def needed(package: str) -> set[str]:
 
 
 def copy(words: list[str], folder: Path, root: Path) -> None:
-    """COPY of files and folders from the checkout."""
     *sources, place = words
     target = root / place.lstrip("/") if place.startswith("/") else folder / place
     for source in sources:

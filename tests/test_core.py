@@ -4,6 +4,7 @@ import dataclasses
 import io
 import math
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -16,7 +17,6 @@ from torch.testing import assert_close
 
 from go1exp import robot
 from go1exp.config.schema.registry import Entry, Term
-from go1exp.mdp.types import StepResult
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.faults import NumericalFault
@@ -47,13 +47,9 @@ def actions(n: int, steps: int, scale: float = 1.5, seed: int = 0) -> Tensor:
     return torch.as_tensor(np.random.default_rng(seed).normal(0.0, scale, (steps, n, 12))).float()
 
 
-def as_dict(result: StepResult) -> dict[str, Tensor]:
-    return {f.name: getattr(result, f.name) for f in dataclasses.fields(StepResult)}
-
-
 def run(core: Go1Core, inputs: Tensor) -> Iterator[dict[str, Tensor]]:
     for action in inputs:
-        yield {k: v.clone() for k, v in as_dict(core.step(action)).items()}
+        yield {name: value.clone() for name, value in vars(core.step(action)).items()}
 
 
 def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
@@ -773,6 +769,7 @@ def test_a_state_that_is_not_finite_is_a_fault_of_that_environment(
     getattr(core.backend, field)[1, column] = value
     with pytest.raises(NumericalFault, match=r"is not finite in environment 1 at step 2$"):
         core.check(core.step(torch.zeros(3, 12)))
+    assert list(Path().iterdir()) == []
 
 
 @pytest.mark.parametrize("termination", ["none", "fall"])
@@ -815,6 +812,7 @@ def test_an_action_that_is_not_finite_is_a_fault_that_names_the_action(start_cor
         core.check(core.step(action))
     assert caught.value.quantity == "action"
     assert np.isnan(caught.value.dump["action"]).tolist() == [k == 5 for k in range(12)]
+    assert list(Path().iterdir()) == []
 
 
 def test_an_observation_that_is_not_finite_is_a_fault_even_when_its_episode_ends(

@@ -836,7 +836,6 @@ def outcome(
 
 def eval_trace(container: dict[str, Any], walk: Walk) -> Trace:
     """The report without the settings that it repeats, and where it lies."""
-
     _, files = outcome("eval", container, walk)
     yield "files", sorted(files)
     for name, content in files.items():
@@ -969,7 +968,6 @@ def gap_trace(container: dict[str, Any], walk: Walk) -> Trace:
 
 def export_trace(container: dict[str, Any], walk: Walk) -> Trace:
     """The policy, what it is said to be, and its trace; not the configuration that goes with them."""
-
     _, files = outcome("export", container, walk)
     yield "files", sorted(files)
     for content in files.values():
@@ -980,7 +978,6 @@ def export_trace(container: dict[str, Any], walk: Walk) -> Trace:
 
 def check_trace(container: dict[str, Any], walk: Walk) -> Trace:
     """What is said of the policy, without the file's name."""
-
     said, _ = outcome("export_check", container, walk)
     yield "said", [re.sub(r"\S+\.zip", "", line) for line in said.splitlines()]
 
@@ -990,7 +987,6 @@ def deploy_trace(container: dict[str, Any], walk: Walk) -> Trace:
 
     What its drives were told, cycle by cycle, and what was logged, but for the account, which repeats settings.
     """
-
     for silent_from in (np.inf, 0.08, 0.0):
         refused, files = "", dict[str, bytes]()
         with lockstep(lambda state, begin=silent_from: state if state.clock < begin else None) as world:  # type: ignore[misc]

@@ -74,12 +74,12 @@ def test_gymnasiums_own_checker_is_content() -> None:
 
 
 def test_gymnasium_makes_it_by_name_with_overrides(registered: None) -> None:
-    env = gymnasium.make("Go1-v0", overrides=[*QUIET, "action.clip=3.0", "sim.episode_s=0.1"])
+    env = gymnasium.make("Go1-v0", overrides=[*QUIET, "action.clip=3.0", "sim.policy_dt=0.01", "sim.episode_s=0.05"])
     try:
         assert isinstance(env.unwrapped, Go1Env)
         assert env.observation_space == gymnasium.spaces.Box(-np.inf, np.inf, (48,), np.float32)
         assert env.action_space == gymnasium.spaces.Box(-2.0, 2.0, (12,), np.float32)
-        assert env.metadata["render_fps"] == 50
+        assert env.metadata["render_fps"] == 100
         observation, info = env.reset(seed=1)
         assert env.observation_space.contains(observation)
         assert info == {}
@@ -147,22 +147,6 @@ def test_gymnasiums_vector_of_robots_is_the_batch(registered: None) -> None:
     assert ended >= 3
 
 
-def test_an_action_that_is_not_finite_is_refused_by_a_batch_and_leaves_no_file(
-    make_core: Make, elsewhere: None
-) -> None:
-    core = make_core(*QUIET, num_envs=3)
-    env = quiet_batch(core)
-    env.reset()
-    action = np.zeros((3, 12), np.float32)
-    action[1, 0] = np.nan
-    with pytest.raises(NumericalFault, match=r"^action is not finite in environment 1 at step 1$"):
-        env.step(action)
-    core.backend.qvel[0, 3] = torch.inf
-    with pytest.raises(NumericalFault):
-        core.check(core.step(torch.zeros(3, 12)))
-    assert list(Path().iterdir()) == []
-
-
 @pytest.mark.parametrize(
     "error", [NumericalFault.not_finite("action", "at step 1"), ConfigError(["a = 1: wrong", "b: too"])]
 )
@@ -183,10 +167,6 @@ def test_make_refuses_a_choice_as_the_command_line_does(group: str, registered: 
             make(overrides=["+reward.gaitt={weight: 1.0}"])
         with pytest.raises(ConfigError, match=r"^rewards: unknown key 'rewards'"):
             make(overrides=["+rewards.gait=1"])
-
-
-def test_the_render_rate_is_that_of_the_policy() -> None:
-    assert Go1Env([*QUIET, "sim.policy_dt=0.01"]).metadata["render_fps"] == 100
 
 
 def trajectory(env: Go1Env, seed: int | None, steps: int = 50) -> list[np.ndarray]:
@@ -352,43 +332,6 @@ def test_it_is_built_without_a_word(make_core: Make) -> None:
     assert env.action_space == gymnasium.spaces.Box(-100.0, 100.0, (12,), np.float32)
 
 
-def test_infos_tell_how_an_episode_ended_and_what_was_seen_last(make_core: Make) -> None:
-    """Three robots; the second is put on its back just before the time limit of the others."""
-    core = make_core(*QUIET[:3], "command=forward", "sim.episode_s=0.2", num_envs=3, noise=False)
-    env = quiet_batch(core)
-    env.reset()
-    returns, given = np.zeros(3), actions(3, 10, 0.3)
-    for k, action in enumerate(given, start=1):
-        if k == 7:
-            core.backend.qpos[1, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0])
-        observation, reward, done, infos = env.step(action)
-        returns += reward
-        if k == 7:
-            assert done.tolist() == [False, True, False]
-            assert infos[0] == infos[2] == {}
-            info, fall = infos[1], returns[1]
-            assert info["TimeLimit.truncated"] is False
-            assert info["episode"]["l"] == 7
-            assert info["episode"]["r"] == pytest.approx(fall, rel=1e-6)
-            assert info["terminal_observation"][8] > 0.8  # on its back
-            np.testing.assert_array_equal(info["terminal_observation"][36:], action[1])
-            np.testing.assert_allclose(observation[1, 6:9], [0.0, 0.0, -1.0])
-            returns[1] = 0.0
-        elif k < 10:
-            assert not done.any()
-            assert infos == [{}, {}, {}]
-    assert done.tolist() == [True, False, True]
-    for i in (0, 2):
-        assert infos[i].keys() == {"terminal_observation", "TimeLimit.truncated", "episode"}
-        assert infos[i]["TimeLimit.truncated"] is True
-        assert infos[i]["episode"]["l"] == 10
-        assert infos[i]["episode"]["r"] == pytest.approx(returns[i], rel=1e-6)
-        assert infos[i]["terminal_observation"].dtype == np.float32
-        np.testing.assert_array_equal(infos[i]["terminal_observation"][36:], given[-1][i])
-        assert not observation[i, 36:].any()
-    assert infos[1] == {}
-
-
 def test_arrays_of_the_batch_are_the_callers_own(make_core: Make) -> None:
     env = quiet_batch(make_core(*LIVELY, num_envs=3))
     kept, copies = [env.reset()], []
@@ -428,8 +371,8 @@ def test_seeding_the_batch_makes_it_reproducible(make_core: Make) -> None:
 def test_the_batch_and_the_core_are_the_same_thing(make_core: Make) -> None:
     env, core = quiet_batch(make_core(*LIVELY, num_envs=3)), make_core(*LIVELY, num_envs=3)
     np.testing.assert_array_equal(env.reset(), core.reset().numpy())
-    ends = 0
-    for action in actions(3, 40):
+    ends = []
+    for action in actions(3, 40, 3.0):
         observation, reward, done, infos = env.step(action)
         result = core.step(torch.as_tensor(action))
         np.testing.assert_array_equal(observation, result.observation.numpy(), strict=True)
@@ -438,10 +381,13 @@ def test_the_batch_and_the_core_are_the_same_thing(make_core: Make) -> None:
         for i, info in enumerate(infos):
             assert bool(info) == done[i]
             if info:
-                ends += 1
-                np.testing.assert_array_equal(info["terminal_observation"], result.final_observation[i].numpy())
-                assert info["TimeLimit.truncated"] == bool(result.truncated[i])
-    assert ends >= 6
+                assert info.keys() == {"terminal_observation", "TimeLimit.truncated", "episode"}
+                last = result.final_observation[i].numpy()
+                np.testing.assert_array_equal(info["terminal_observation"], last, strict=True)
+                assert info["episode"] == {"r": float(result.episode_return[i]), "l": int(result.episode_length[i])}
+                assert info["TimeLimit.truncated"] is bool(result.truncated[i])
+                ends.append(info["TimeLimit.truncated"])
+    assert min(ends.count(True), ends.count(False)) >= 2
 
 
 def test_an_attribute_that_does_not_exist_is_said_not_to(make_core: Make) -> None:

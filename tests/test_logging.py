@@ -163,7 +163,6 @@ def test_the_table_agrees_with_what_the_learner_reports(tmp_path: Path, monkeypa
 
 
 def events_of(run: Path) -> Any:
-    """Read what was logged for TensorBoard."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events = EventAccumulator(str(run / "tensorboard"))

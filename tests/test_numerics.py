@@ -190,8 +190,6 @@ def test_dry_friction_is_rigid_within_a_step(bound: float) -> None:
 
 
 def main() -> None:
-    """Print the tables."""
-
     def line(name: str, *columns: Any) -> None:
         print(f"| {name} | " + " | ".join(c if isinstance(c, str) else f"{c:.2f}" for c in columns) + " |")
 

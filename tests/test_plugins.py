@@ -103,7 +103,6 @@ def nothing_left(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[No
 
 
 def go1exp(*arguments: str) -> int:
-    """Run the command line in this process."""
     before, sys.argv = sys.argv, ["go1exp", *arguments]
     try:
         return main()

@@ -61,7 +61,6 @@ class Command:
 
     @property
     def verb(self) -> str:
-        """First word."""
         return self.words[0]
 
 

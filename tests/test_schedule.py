@@ -141,28 +141,22 @@ def test_values_are_written_in_place_where_a_captured_step_reads_them() -> None:
     core, schedule = built("actuator=delay", *(ramp(f"{text}, over: 100", key) for key, text in texts.items()))
     gait = next(t for t in core.terms.rewards if t.key == "gait")
     feet = core.backend.ids("geom", tuple(f"{leg}_foot" for leg in robot.LEGS))
-    live = {
-        "weights": core.terms.weights,
-        "scale": gait.parameters["scale"],
-        "delays": core.plant.actuator._range,
-        "contact": core.backend.field("geom_solref"),
-    }
-    places = {name: tensor.data_ptr() for name, tensor in live.items()}
+
+    def live() -> list[torch.Tensor]:
+        scale, delays = gait.parameters["scale"], core.plant.actuator._range
+        return [core.terms.weights, scale, delays, core.backend.field("geom_solref")]
+
+    places = [tensor.data_ptr() for tensor in live()]
     schedule.advance(50, {})
-    assert core.terms.weights[core.terms.rewards.index(gait)] == pytest.approx(2.0 * 0.02)
-    assert live["scale"] == pytest.approx(0.2)
-    assert live["delays"].tolist() == pytest.approx([0.005, 0.01])
-    assert live["contact"][:, feet, 0].unique().item() == pytest.approx(0.0125)
+    weights, scale, delays, contact = live()
+    assert weights[core.terms.rewards.index(gait)] == pytest.approx(2.0 * 0.02)
+    assert scale == pytest.approx(0.2)
+    assert delays.tolist() == pytest.approx([0.005, 0.01])
+    assert contact[:, feet, 0].unique().item() == pytest.approx(0.0125)
     core.reset()
     assert (core.plant.actuator.delay >= 0.005).all()
     assert (core.plant.actuator.delay <= 0.01).all()
-    now = {
-        "weights": core.terms.weights,
-        "scale": next(t for t in core.terms.rewards if t.key == "gait").parameters["scale"],
-        "delays": core.plant.actuator._range,
-        "contact": core.backend.field("geom_solref"),
-    }
-    assert {name: tensor.data_ptr() for name, tensor in now.items()} == places
+    assert [tensor.data_ptr() for tensor in live()] == places
 
 
 @pytest.mark.gpu

@@ -13,14 +13,9 @@ from collections import namedtuple
 from types import FrameType
 
 from go1exp.base import errors, signals
-from go1exp.cli.verbs import EVERY as EVERY
-from go1exp.cli.verbs import LISTS as LISTS
-from go1exp.cli.verbs import MODULES as MODULES
-from go1exp.cli.verbs import ONE_BLAS_THREAD as ONE_BLAS_THREAD
-from go1exp.cli.verbs import POSITIONAL as POSITIONAL
-from go1exp.cli.verbs import SUBVERBS as SUBVERBS
-from go1exp.cli.verbs import VERBS as VERBS
-from go1exp.cli.verbs import parted, quoted
+from go1exp.cli.verbs import EVERY, LISTS, MODULES, ONE_BLAS_THREAD, POSITIONAL, SUBVERBS, VERBS, parted, quoted
+
+__all__ = ["EVERY", "LISTS", "MODULES", "ONE_BLAS_THREAD", "POSITIONAL", "SUBVERBS", "VERBS", "main"]
 
 HELP = """usage: go1exp VERB [key=value ...]
 

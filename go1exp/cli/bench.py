@@ -138,7 +138,6 @@ def _actuator(task: TaskConfig, much: Measured) -> dict[str, float]:
 
 
 def _mpc(task: TaskConfig, much: Measured) -> dict[str, float]:
-    """Run the suite of the model predictive controller, with its own settings."""
     from go1exp.cli import subjects
     from go1exp.evaluate.bench import deploy
 
@@ -148,7 +147,6 @@ def _mpc(task: TaskConfig, much: Measured) -> dict[str, float]:
 
 
 def _gpu(config: TrainConfig, overrides: list[str], much: Measured) -> dict[str, float]:
-    """Run the suite that needs a GPU, and name that."""
     import torch
 
     if not torch.cuda.is_available():

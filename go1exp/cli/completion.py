@@ -185,7 +185,6 @@ def _as_bash_inserts_them(words: Sequence[str], line: str, breaks: str) -> list[
 
 
 def _by_position(verb: str, word: str, before: Sequence[str], folders: Sequence[Path]) -> list[str]:
-    """Complete a word that is given by position alone."""
     keys = POSITIONAL.get(verb, ())
     place = len(parted(before)[2])
     if not keys or (place >= len(keys) and keys[0] not in LISTS):
@@ -232,7 +231,6 @@ def _values(verb: str, key: str, value: str, before: Sequence[str], folders: Seq
 
 
 def _members(verb: str, key: str, value: str, before: Sequence[str], folders: Sequence[Path]) -> list[str]:
-    """Complete one choice, name or path."""
     last = key.rsplit(".", 1)[-1]
     answers: list[str] = []
     if key in groups_of(verb) or (key not in _settings(verb) and any(key in groups_in(folder) for folder in folders)):
@@ -265,7 +263,6 @@ def _levels(names: Sequence[str] | dict[str, Path], value: str) -> list[str]:
 
 
 def _places(verb: str, key: str, value: str) -> Iterator[str]:
-    """Complete a value that is a file or a folder."""
     endings = () if key in RUNS else SUFFIXES.get(f"{verb}.{key}") or SUFFIXES[key]
     return _paths(value, endings, runs=key in (*RUNS, "subjects"))
 

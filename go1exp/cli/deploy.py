@@ -86,7 +86,6 @@ class DeploySettings(Stages):
 
 
 def _task(container: dict[str, object]) -> int:
-
     other = {name: container[name] for name in ROBOT_GROUPS if container.get(name) is not None}
     settings = parse(DeploySettings, {name: value for name, value in container.items() if name not in ROBOT_GROUPS})
     controller = subjects.chosen_controller(settings.controller)
@@ -177,7 +176,6 @@ def _mover(controller: MpcSettings | None) -> Mover | None:
 
 
 def _motion(settings: DeploySettings, controlled: bool) -> PlayedMotion | None:
-    """Return the motion of a suspended robot, if one is requested."""
     if settings.motion is None:
         if settings.gains is not None:
             raise ConfigError(["gains: are of motion; a policy walks with those that it was trained with"])

@@ -219,7 +219,6 @@ def result_lines(result: Result) -> list[str]:
 
 
 def _measures(given: object) -> list[Term]:
-    """Resolve the measures, all of them for None; raise ConfigError with every problem of them."""
     from go1exp.mdp.measures import every_measure
 
     if given is None:

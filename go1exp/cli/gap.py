@@ -162,7 +162,6 @@ def _view(settings: GapVerb, parts: dict[str, Any], where: tuple[str, int]) -> i
 
 
 def _progress() -> Callable[[str, float], None]:
-    """Return a callback that shows how far the work is, and prints the name of each step once."""
     bar, last = spinner(100, "gap"), [""]
 
     def show(what: str, share: float) -> None:

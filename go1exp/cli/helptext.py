@@ -178,7 +178,6 @@ def _plain(value: object) -> str:
 
 
 def _beside(key: str, text: str, width: int = KEY_WIDTH) -> list[str]:
-    """Return a key and its text side by side, the text wrapped; a long key has a line of its own."""
     available = max(60, min(120, shutil.get_terminal_size((120, 24)).columns)) - width - 4
     wrapped = textwrap.wrap(text.replace("``", "").replace("None", "null").rstrip("."), available) or [""]
     indent = " " * (width + 4)

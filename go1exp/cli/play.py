@@ -92,7 +92,6 @@ def _log(settings: PlaySettings, where: tuple[str, int]) -> None:
 def _show(
     core: Go1Core, policy: Policy, settings: PlaySettings, out: Path, progress: Callable[[int, int], None] | None
 ) -> None:
-    """Write clip and picture, with their ``progress``, or open the live viewer without one."""
     from go1exp.evaluate import video
     from go1exp.sim.env.camera import RenderingUnavailable, missing_for_mp4
 

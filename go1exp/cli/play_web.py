@@ -25,7 +25,6 @@ from go1exp.deploy.sim_robot import SimConfig, SimSettings
 
 if TYPE_CHECKING:
     from go1exp.config.schema.physics import BackendConfig
-    from go1exp.deploy.sim_robot import SimConfig
     from go1exp.deploy.sim_robot.machine import Body
     from go1exp.evaluate.agents import Agent
     from go1exp.evaluate.viewer.requests import Ground

@@ -117,7 +117,6 @@ def rig_groups(container: Mapping[str, object]) -> tuple[str, ...]:
 
 
 def _motions(given: object) -> list[Term]:
-    """Resolve the excitations; raise ConfigError with every problem of them."""
     if not given or not isinstance(given, list):
         what = "at least one is needed" if given == [] else "must be a list"
         raise ConfigError([f"excitation = {given!r}: {what}, such as [steps,{{chirp: {{band: [0.2, 5.0]}}}}]"])

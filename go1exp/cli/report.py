@@ -61,7 +61,6 @@ def _protocols(given: object, asked: bool) -> list[Chosen | None]:
 
 
 def _evaluate(runs: Study, settings: ReportSettings, protocols: Sequence[Chosen | None]) -> None:
-    """Make the missing evaluations, with their progress on stderr."""
     import go1exp.mdp.measures  # noqa: F401  (registers them)
     from go1exp.evaluate.report.evaluating import evaluate_missing, missing
     from go1exp.evaluate.report.evaluations import check_figures, evaluations

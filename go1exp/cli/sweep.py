@@ -117,7 +117,6 @@ def _asks_for_more(overrides: Sequence[str]) -> bool:
 def _checked(
     rules: Rules, app: App, folders: Sequence[Path], folder: Path, planned: Sequence[index.Job], runs: Launcher
 ) -> list[Any]:
-    """Compose and check every job, and that the launcher can work."""
     jobs: list[Any] = []
     problems: dict[str, list[int]] = {}
     names = [job.name for job in planned]
@@ -246,7 +245,6 @@ def _share_of_cores(rules: Rules, run: Path, known: Index, runs: Launcher) -> li
 
 
 def _command(run: Path, overrides: Sequence[str], cwd: str) -> Command:
-    """Return the command that a job is in a process of its own."""
     place = [f"resume={quoted(str(run))}", f"hydra.run.dir={quoted(str(run))}", "hydra.output_subdir=null"]
     words = (sys.executable, "-m", "go1exp.cli.child", PARENT, CORES, "train", *place, *overrides)
     path = os.environ.get("PYTHONPATH")

@@ -52,7 +52,6 @@ def _resumed(run: Path, overrides: list[str]) -> dict[str, Any]:
 
 
 def _may_change(key: str) -> bool:
-    """Return whether a resumed run may change a setting."""
     return any(key == other or key.startswith(f"{other}.") for other in RESUMABLE)
 
 
@@ -143,7 +142,6 @@ def _refuse_one_of_a_sweep(about: hydra_main.Job) -> None:
 
 
 def _go_on(run: Path, overrides: list[str]) -> int | None:
-    """Do what a job of a sweep does in its run folder; return the exit status."""
     job = _planned(run, overrides)
     check(job)
     return _run(job)
@@ -174,7 +172,6 @@ def plan(job: TrainJob) -> None:
 
 
 def _run(job: TrainJob) -> int | None:
-    """Train as the only one in the run folder; return the exit status."""
     from go1exp.train import run_state
 
     with run_state.locked(job.run):
@@ -220,7 +217,6 @@ def _is_finished(job: TrainJob) -> bool:
 
 
 def _train(job: TrainJob, first: Weights | None) -> int | None:
-    """Train in a folder that is locked, and keep its state; return the exit status."""
     from go1exp.train import checkpoint, run_folder, run_state, trainer
 
     if job.resumed and run_state.read(job.run).state != "not started" and not checkpoint.checkpoints(job.run):

@@ -103,7 +103,6 @@ def _no_such_choice(missing: str, folders: Sequence[Path]) -> str | None:
 
 
 def _no_such_key(key: str, given: str, name: str, overrides: Sequence[str], folders: Sequence[Path]) -> str:
-    """Name the key that does not exist, what was given, and the nearest keys that exist."""
     if "@" in key:
         return f"{given}: no such key {key!r}; a file with `override /...` begins with the line `# @package _global_`"
     if named := next((group for group, folder in FOLDERS.items() if folder == key), None):

@@ -181,8 +181,6 @@ class VerbSource(FileConfigSource):
 
 
 class _Folders(SearchPathPlugin):
-    """Puts the folders on Hydra's search path."""
-
     folders: ClassVar[tuple[Path, ...]] = ()
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
@@ -288,7 +286,6 @@ def _kept(verb: str, choices: tuple[str, ...], folders: tuple[Path, ...], state:
 
 
 def _stamps(folder: str | Path) -> tuple[tuple[str, int, int], ...]:
-    """Return name, time of change and size of each file below a folder."""
     stamps = []
     for top, _, names in os.walk(folder, followlinks=True):
         for file in (os.path.join(top, name) for name in names):
@@ -333,7 +330,6 @@ def refusal(error: Exception, verb: str, overrides: Sequence[str], folders: Sequ
 
 
 def _culprit(verb: str, overrides: Sequence[str], folders: tuple[Path, ...]) -> Refusal | None:
-    """Return the override that is refused, found by applying one after the other."""
     choices, values = _parsed(overrides)
     for o in choices:
         chosen = o.value()

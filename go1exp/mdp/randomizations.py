@@ -65,7 +65,6 @@ Operation = Literal["set", "add", "scale"]
 def _vary(
     model: ModelFields, name: str, where: tuple[Tensor | int, ...], mask: Tensor, op: Operation, draw: Tensor
 ) -> None:
-    """Write ``op(nominal, draw)`` into ``field[mask][where]``."""
     live, nominal = model.field(name), model.nominal(name)
     index = (slice(None), *where)
     start = nominal[index]

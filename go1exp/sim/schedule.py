@@ -113,14 +113,12 @@ def changeable(parts: Mapping[str, Any]) -> list[str]:
 
 
 def _numbers(term: Term) -> list[str]:
-    """Return the parameters of a reward that are one number each and act when they change."""
     fixed = term.entry.traits.get("fixed", ())
     values = term.parameters.items()
     return [k for k, v in values if isinstance(v, int | float) and not isinstance(v, bool) and k not in fixed]
 
 
 def _target_problems(path: str, ramp: Ramp, parts: Mapping[str, Any]) -> list[str]:
-    """Return what is wrong with the setting that a ramp names and with its two values."""
     if _left_out(ramp, parts):
         return []
     known = changeable(parts)
@@ -141,7 +139,6 @@ def _target_problems(path: str, ramp: Ramp, parts: Mapping[str, Any]) -> list[st
 
 
 def _value_problems(path: str, target: str, value: Value, parts: Mapping[str, Any]) -> list[str]:
-    """Return what is wrong with one value of a setting, each beginning with ``path``."""
     if target == CONTACT_TIME:
         settings = {"time_constant": value, "cone": "pyramidal", "impratio": 1.0}
         try:

@@ -247,7 +247,6 @@ REGISTERED_AS = {"critic": "observation"}
 
 
 def _section(kind: type, settings: object, path: str) -> tuple[Any, list[str]]:
-    """Validate one section; return the dataclass (or None) and the problems."""
     if not isinstance(settings, Mapping):
         return None, [f"{path} = {settings!r}: must be a mapping"]
     try:
@@ -316,7 +315,6 @@ def time_rules(sim: SimConfig) -> list[str]:
 
 
 def _randomization_rules(terms: tuple[Term, ...]) -> list[str]:
-    """Rules between randomisations, and between each and when it is drawn."""
     problems, setters = [], dict[str, str]()
     for term in terms:
         what = term.entry.traits.get("sets")
@@ -332,7 +330,6 @@ def _randomization_rules(terms: tuple[Term, ...]) -> list[str]:
 
 
 def _cross_rules(parts: Mapping[str, Any]) -> list[str]:
-    """Rules between sections."""
     problems = []
     if actuator := parts.get("actuator"):
         problems += actuator_problems(actuator, parts.get("effect") or (), robot.JOINTS)

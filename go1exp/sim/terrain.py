@@ -201,7 +201,6 @@ def build_terrain(config: TerrainConfig) -> Terrain:
 
 
 def _build(config: TerrainConfig) -> Terrain:
-    """Build a plane or a field of tiles."""
     if config.kind == "flat":
         return Terrain(np.zeros((2, 2)), -0.5, -0.5, 1.0, np.zeros((1, 1, 3)), ("flat",), config)
 

@@ -92,11 +92,9 @@ class AsyncEvaluation:
             self._best = wanted["score"]
 
     def _policy(self, iteration: float) -> Path:
-        """Return the file of the policy that is evaluated after an iteration."""
         return self._run / FOLDER / f"{int(iteration):06d}{SUFFIX}"
 
     def _keep(self, row: dict[str, float], policy: Path) -> None:
-        """Make a policy the best one; ``row`` is what its evaluation came to."""
         write_bytes(self._run / BEST, policy.read_bytes())
         write_json(self._run / BEST_ROW, row)
         self._best = row["score"]
@@ -185,7 +183,6 @@ class AsyncEvaluation:
         return figures
 
     def _take(self, result: dict[str, Any] | None) -> dict[str, float]:
-        """Keep a result; return the figures of an evaluation."""
         if result is None:
             if self._waiting:
                 self.problems.append("the process of evaluations and videos ended early")
@@ -227,7 +224,6 @@ def _row_of_best(run: Path) -> dict[str, float] | None:
 
 
 def _rows(file: Path) -> list[dict[str, float]]:
-    """Return the rows of earlier evaluations, those that are whole."""
     if not file.is_file():
         return []
     with file.open(newline="") as text:

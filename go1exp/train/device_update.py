@@ -76,9 +76,8 @@ class DeviceRolloutBuffer(MeanRolloutBuffer):
     def estimate(self, last_values: Tensor, last_ended: Tensor) -> None:
         """Compute advantages and returns, and join the rollouts of the group.
 
-        Args:
-            last_values: (n,) of the states after the rollout.
-            last_ended: (n,) whether an episode ended in its last step.
+        ``last_values`` (n,) are of the states after the rollout; ``last_ended`` (n,) says whether an episode ended in
+        its last step.
         """
         d = self.data
         write_advantages(
@@ -125,14 +124,9 @@ class DeviceRolloutBuffer(MeanRolloutBuffer):
 
 
 class DeviceUpdate:
-    """All gradient steps of an iteration.
+    """All gradient steps of an iteration; ``captures`` records the step as a CUDA graph, else it is made call by call.
 
     The memory of policy and optimiser must stay where it is from the first call on: restore checkpoints before it.
-
-    Args:
-        ppo: the learner.
-        buffer: its rollouts.
-        captures: record the gradient step as a CUDA graph; else make its calls one by one.
     """
 
     def __init__(self, ppo: AdaptivePPO, buffer: DeviceRolloutBuffer, captures: bool) -> None:
@@ -271,7 +265,6 @@ class DeviceUpdate:
         return step
 
     def _recorded(self, work: Callable[[], None], stream: torch.cuda.Stream) -> Callable[[], None]:
-        """Record ``work`` as one CUDA graph and return the replay."""
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
             work()
@@ -279,7 +272,6 @@ class DeviceUpdate:
 
 
 def _moments(state: Mapping[Tensor, dict[str, Tensor]]) -> list[Tensor]:
-    """Return all tensors of Adam's state: moments and counts of steps."""
     return [value for of_parameter in state.values() for value in of_parameter.values()]
 
 

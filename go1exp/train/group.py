@@ -189,7 +189,6 @@ def _together(key: str, values: Sequence[float]) -> float:
 
 
 def _mapped(state: Any, change: Callable[[Tensor], Tensor]) -> Any:
-    """Return plain data with all of its tensors changed."""
     if isinstance(state, Tensor):
         return change(state)
     if isinstance(state, Mapping):

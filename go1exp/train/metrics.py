@@ -150,14 +150,9 @@ def _table(rows: Sequence[Mapping[str, object]]) -> Any:
 def log_tables(
     tables: Mapping[str, Sequence[Mapping[str, Any]]], page: Path, project: str, how: str, folder: Path
 ) -> None:
-    """Log the tables of a report, and its page, as a run of its own.
+    """Log the tables of a report, rows by name, and its HTML page as a run of its own in a project of Weights & Biases.
 
-    Args:
-        tables: rows by name.
-        page: HTML file.
-        project: of Weights & Biases.
-        how: offline or online.
-        folder: where an offline run is left.
+    ``how`` is offline, where the run is left in ``folder``, or online.
     """
     wandb = _wandb()
     run = wandb.init(
@@ -185,8 +180,7 @@ def _of_one_kind(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def check_account(config: LoggerConfig) -> None:
     """Refuse to log online to Weights & Biases without a key: it would ask, or fail, when all is built.
 
-    Raises:
-        ConfigError: if neither the environment nor a netrc file holds one.
+    Raises ConfigError if neither the environment nor a netrc file holds one.
     """
     if config.wandb is None or wandb_mode(config.wandb) != "online":
         return
@@ -227,7 +221,6 @@ class CsvWriter(KVWriter):
                 warnings.warn(f"{path}: rows of {iteration - kept} of {iteration} iterations are missing", stacklevel=2)
 
     def _cut(self, name: str, path: Path, iteration: int) -> int:
-        """Leave the whole rows up to ``iteration``; return their number."""
         rows: list[list[str]] = []
         with path.open(newline="", encoding="utf-8", errors="replace") as file, contextlib.suppress(csv.Error):
             rows = list(csv.reader(file))
@@ -321,14 +314,9 @@ def dump_late(logger: Logger, steps: int) -> None:
 
 
 def make_logger(config: LoggerConfig, run: Path, iteration: int, settings: dict[str, object], steps: int = 0) -> Logger:
-    """Build SB3's logger with the configured writers.
+    """Build SB3's logger with the configured writers, in the folder ``run``; Weights & Biases gets ``settings``.
 
-    Args:
-        config: which ones.
-        run: the run folder.
-        iteration: that training continues from: later rows are dropped.
-        settings: the run's configuration, for Weights & Biases.
-        steps: environment steps at ``iteration``.
+    Training continues from ``iteration``, after ``steps`` environment steps: later rows are dropped.
     """
     writers: list[KVWriter] = []
     if config.tensorboard:

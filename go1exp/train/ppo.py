@@ -193,7 +193,6 @@ class AdaptivePPO(PPO):
         """Leave the rate where the last minibatch put it; SB3 would set it from a schedule over time."""
 
     def _check_gradient(self, name: str, parameter: Tensor) -> None:
-        """Raise NumericalFault if the gradient that just arrived is not finite."""
         if parameter.grad is not None and not torch.isfinite(parameter.grad.sum()):
             raise NumericalFault.not_finite(f"gradient of policy.{name}", f"in iteration {self.iteration + 1}")
 
@@ -248,7 +247,6 @@ class AdaptivePPO(PPO):
         return [float(figure.detach()) for figure in loss]
 
     def _report(self, figures: dict[str, list[float]]) -> None:
-        """Log an update as SB3 does; ``figures`` of each gradient step, by ``LOSS_FIGURES``."""
         last_epoch = slice(-self.config.minibatches, None)  # the last steps, where a limit ended the update before
         means = {
             name: float(np.mean(values[last_epoch if name == "approx_kl" else slice(None)]))
@@ -269,7 +267,6 @@ class AdaptivePPO(PPO):
             self.logger.record("train/gradient_steps", len(figures["loss"]))
 
     def _close_iteration(self) -> None:
-        """Count and report the iteration that is complete."""
         self.iteration += 1
         self.logger.record("train/kl", float(np.mean(self._kl)))
         self.logger.record("train/learning_rate", float(self.policy.optimizer.param_groups[0]["lr"]))

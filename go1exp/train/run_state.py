@@ -44,11 +44,8 @@ def locked(run: Path) -> Iterator[None]:
     """Be the only one that trains in ``run``, which is made if it is not there.
 
     A lock of the operating system (``flock``, on NFS as well) ends with the process, however that ends; the file stays.
-    What a killed process left half-written is deleted.
-
-    Raises:
-        RunInUse: if another process has it.
-        OSError: if the folder cannot be written.
+    What a killed process left half-written is deleted. Raises RunInUse if another process has it, OSError if the folder
+    cannot be written.
     """
     try:
         run.mkdir(parents=True, exist_ok=True)
@@ -82,7 +79,6 @@ def in_use(run: Path) -> bool:
 
 
 def _acquired(run: Path) -> BaseFileLock:
-    """Return the lock, taken; raise RunInUse if it is another's."""
     try:
         try:
             lock: BaseFileLock = FileLock(run / LOCK, timeout=0, preserve_lock_file=True)
@@ -127,11 +123,7 @@ class RunState:
 
 
 def write(run: Path, state: State, cause: str = "") -> None:
-    """Note the state; ``cause`` is the message of an error.
-
-    Raises:
-        OSError: if it cannot be written.
-    """
+    """Note the state; ``cause`` is the message of an error. Raise OSError if it cannot be written."""
     write_json(run / FILE, asdict(RunState(state, cause)))
 
 

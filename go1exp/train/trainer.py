@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import FrameType, TracebackType
 
@@ -146,11 +146,7 @@ def trained_task(config: TrainConfig) -> TaskConfig:
 
 
 def build(config: TrainConfig, group: Group | None = None) -> AdaptivePPO:
-    """Build learner and environment, of a member of ``group`` with its share of the robots.
-
-    Raises:
-        ConfigError: if a device is not there.
-    """
+    """Build a ``group`` member's learner, and environment with its share of robots; ConfigError if it has no device."""
     preflight.check_devices(config)
     if config.process.torch_threads:
         torch.set_num_threads(config.process.torch_threads)
@@ -238,7 +234,6 @@ def train_as_member(container: dict[str, object], run: Path, group: Group) -> No
 
 
 def _learn(ppo: AdaptivePPO, config: TrainConfig, logger: Logger) -> None:
-    """Make the iterations that are left."""
     ppo.set_logger(logger)
     left = config.ppo.iterations * config.ppo.num_envs * config.ppo.steps - ppo.num_timesteps
     if left > 0:
@@ -249,7 +244,6 @@ def _learn(ppo: AdaptivePPO, config: TrainConfig, logger: Logger) -> None:
 
 
 def _begun(config: TrainConfig, run: Path, first: Weights | None, group: Group) -> AdaptivePPO:
-    """Return the learner as training begins or goes on with it."""
     ppo = build(config, group)
     latest = group.agreed(checkpoint.load_latest(run)[1].name if group.first and checkpoint.checkpoints(run) else None)
     if latest:
@@ -263,22 +257,18 @@ def _begun(config: TrainConfig, run: Path, first: Weights | None, group: Group) 
     return ppo
 
 
+@dataclass
 class _Closing:
     """End of an iteration: metrics, progress, schedule, checkpoint, and the end of training if requested."""
 
-    def __init__(
-        self,
-        config: TrainConfig,
-        run: Path,
-        logger: Logger,
-        progress: Progress | None,
-        asked_to_stop: Callable[[], bool],
-        evaluation: AsyncEvaluation | None = None,
-        stop: EarlyStop | None = None,
-    ) -> None:
-        self.config, self.run, self.logger, self.progress = config, run, logger, progress
-        self.asked_to_stop, self.evaluation, self.stop = asked_to_stop, evaluation, stop
-        self._clock = time.monotonic()
+    config: TrainConfig
+    run: Path
+    logger: Logger
+    progress: Progress | None
+    asked_to_stop: Callable[[], bool]
+    evaluation: AsyncEvaluation | None = None
+    stop: EarlyStop | None = None
+    _clock: float = field(default_factory=time.monotonic)
 
     def __call__(self, ppo: AdaptivePPO) -> None:
         """Close the iteration that ``ppo`` has just completed."""
@@ -286,11 +276,9 @@ class _Closing:
         self.logger.record("iteration", ppo.iteration)
         self.logger.record("time/steps_per_s", self.config.ppo.num_envs * steps / (now - self._clock))
         self._clock = now
-        for key, value in ppo.group.metrics(ppo.core.drain_metrics(steps)).items():
-            self.logger.record(key, value)
-        for key, value in ppo.schedule.metrics().items():
-            self.logger.record(key, value)
-        for key, value in (self.evaluation.collect() if self.evaluation else {}).items():
+        figures = ppo.group.metrics(ppo.core.drain_metrics(steps)) | ppo.schedule.metrics()
+        figures |= self.evaluation.collect() if self.evaluation else {}
+        for key, value in figures.items():
             self.logger.record(key, value)
         logged = dict(self.logger.name_to_value)
         if self.progress:
@@ -316,7 +304,6 @@ class _Closing:
 
 
 def _keep(fault: NumericalFault, run: Path) -> None:
-    """Write the moment at which a number was not finite."""
     with opened(run / "fault.npz") as file:
         np.savez(file, allow_pickle=False, **fault.dump)
     write_json(run / "fault.json", {"quantity": fault.quantity, "message": str(fault)}, indent=None)

@@ -156,11 +156,7 @@ def restored() -> Iterator[None]:
 
 
 def installed() -> list[Plugin]:
-    """Import the packages that offer terms by an entry point, once; return them.
-
-    Raises:
-        ConfigError: one line for each that fails.
-    """
+    """Import, once, the packages that offer terms by an entry point; return them, or raise ConfigError: a line each."""
     global _installed
     if _installed is not None:
         return list(_installed.values())
@@ -228,7 +224,6 @@ def _module(name: str) -> tuple[str, Path | None]:
 
 
 def _keep_active(modules: Collection[str]) -> None:
-    """Put out of force the plugins of other modules."""
     for module in [m for m in _active if m not in modules]:
         for entry in _active.pop(module).entries:
             registry.remove(entry)
@@ -304,7 +299,6 @@ def _import(module: str, name: str, file: Path | None) -> Plugin:
 
 
 def _reason(error: BaseException, module: str, name: str, file: Path | None) -> str:
-    """Return the error of a plugin and its place in one line."""
     if isinstance(error, DuplicateError):
         return str(error)
     if isinstance(error, ModuleNotFoundError) and file is None and module.startswith(str(error.name)):

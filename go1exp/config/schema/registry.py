@@ -254,11 +254,7 @@ MORE: list[Callable[[], object]] = []
 
 
 def register(group: str, name: str, **traits: object) -> Callable[[F], F]:
-    """Class or function decorator: make the target known to ``group`` as ``name``.
-
-    Raises:
-        DuplicateError: if the group has a member of that name.
-    """
+    """Make the class or function known to ``group`` as ``name``; raise DuplicateError if it has one so named."""
 
     def decorate(target: F) -> F:
         add(Entry(group, name, target, traits))

@@ -104,8 +104,6 @@ def mirrored(s: Snapshot) -> Snapshot:
 
 
 class _Made:
-    """A term for n robots: its function, or an object of its class."""
-
     def __init__(self, entry: Entry, values: dict[str, Any], n: int) -> None:
         self.n, self.values, self.target = n, values, entry.target
         self.object = entry.target(TermSetup(n, torch.device("cpu"), DT), **values) if entry.remembers else None
@@ -205,7 +203,6 @@ def _check(entry: Entry, values: dict[str, Any], exact: bool, shape: tuple[int, 
 
 
 def _check_memory(entry: Entry, values: dict[str, Any], moments: list[Snapshot]) -> None:
-    """Check what a term with a memory promises beyond the others."""
     one, other, fresh = (_Made(entry, values, ODD) for _ in range(3))
     memory = one.object
     assert memory is not None

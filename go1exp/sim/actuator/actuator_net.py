@@ -360,7 +360,6 @@ def write_onnx(
 def _layers(
     weights: Sequence[np.ndarray], biases: Sequence[np.ndarray], skip: np.ndarray
 ) -> tuple[list[NodeProto], list[TensorProto]]:
-    """Return the graph's nodes in order, and its constants."""
     from onnx import helper, numpy_helper
 
     single = skip.shape[0] == 1

@@ -48,10 +48,7 @@ Piece = tuple[int, int, int]
 def padded_rows(rows: int, counts: Sequence[int], device: torch.device) -> int:
     """Return how many rows to allocate for ``rows`` robots, so that no robot's bits depend on how many there are.
 
-    Args:
-        rows: robots, N.
-        counts: joints of a robot that each net serves; a net's columns are its joints times the rows.
-        device: of the buffers.
+    ``counts``: joints of a robot that each net serves; a net's columns are its joints times the rows.
     """
     threads = torch.get_num_threads() if device.type == "cpu" else 1
     step = max(LANES // math.gcd(LANES, count) for count in counts)
@@ -101,7 +98,6 @@ class GroupedMLP:
                     self._calls.append((torch.addmm, (out, linear[net], self._x[:, start:stop]), out))
 
     def _add_layers(self, pieces: list[Piece], weights: list[list[Tensor]], work: list[Tensor], spare: Tensor) -> None:
-        """Write down the calls for one block."""
         first, width = pieces[0][1], pieces[-1][2] - pieces[0][1]
         source, depth = self._x[:, first : first + width], len(weights[0])
         for k in range(depth):

@@ -206,7 +206,6 @@ class Net(Memory):
 
 
 def _misfits(info: NetInfo, setup: ActuatorSetup) -> list[str]:
-    """Return why a net is not one for these actuators."""
     problems = []
     if missing := [joint for joint in setup.joints if joint not in info.joints]:
         problems.append(f"is for {info.robot!r} with joints {', '.join(info.joints)}; there is none for {missing[0]}")

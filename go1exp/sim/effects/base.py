@@ -157,7 +157,6 @@ class Param:
         return Annotated[float, Field(ge=self.low, le=self.high)]
 
     def _apart(self, value: float) -> float:
-        """Return a value that is null or large enough."""
         if value != self.null and value < self.smallest:
             raise ValueError(f"must be at least {self.smallest:g}, or {self.null:g} for that of the model")
         return value

@@ -41,7 +41,6 @@ def on_mount(effects: Iterable[Term]) -> bool:
 
 
 def _values_problems(term: Term, path: str, joints: Sequence[str]) -> list[str]:
-    """Return what is wrong with the joints that a term's values name."""
     problems = []
     for name, value in term.parameters.items():
         if isinstance(value, dict | tuple) and name in getattr(term.entry.target, "joint_values", ()):

@@ -71,23 +71,15 @@ def robot_bytes(task: TaskConfig, robots: int) -> int:
 
 
 def _size(state: object) -> int:
-    """Return the bytes of all tensors in nested dictionaries."""
     if isinstance(state, dict):
         return sum(map(_size, state.values()))
     return state.nbytes if isinstance(state, Tensor) else 0
 
 
 def refuse_too_many(key: str, value: int, task: TaskConfig, each: int = 1) -> None:
-    """Refuse robots that for certain do not fit into memory.
+    """Refuse robots that for certain do not fit into memory: ConfigError naming the setting, and how many would fit.
 
-    Args:
-        key: setting that says how many robots there are.
-        value: its value.
-        task: what they do.
-        each: robots for each of it.
-
-    Raises:
-        go1exp.config.schema.registry.ConfigError: naming the setting, and how many would fit.
+    ``value`` of the setting ``key``, times ``each`` robots, do ``task``.
     """
     available = free_on(device_of(task.backend))
     one = each * robot_bytes(task, value * each)
@@ -104,11 +96,7 @@ def task_of(overrides: object) -> TaskConfig:
 
 
 def whole(name: str, value: Any, least: int) -> int:
-    """Return a whole number of at least ``least``.
-
-    Raises:
-        ConfigError: if ``value`` is something else.
-    """
+    """Return a whole number of at least ``least``; raise ConfigError if ``value`` is something else."""
     try:
         number = operator.index(value)
     except TypeError:
@@ -119,11 +107,7 @@ def whole(name: str, value: Any, least: int) -> int:
 
 
 def listed(overrides: Any) -> Sequence[str]:
-    """Return overrides as a list.
-
-    Raises:
-        ConfigError: if they are one text, or one of them is no text.
-    """
+    """Return overrides as a list; raise ConfigError if they are one text, or one of them is no text."""
     if isinstance(overrides, str):
         raise ConfigError([f"overrides = {overrides!r}: must be a list of texts, such as [{overrides!r}]"])
     given = list(overrides) if isinstance(overrides, Iterable) else [overrides]

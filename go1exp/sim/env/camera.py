@@ -92,9 +92,7 @@ def choose_gl() -> str:
     """Return the GL library to draw with: the one that MUJOCO_GL names, else the first that works on this machine.
 
     Each is tried in a process of its own (0.6 s), because a failed import would keep PyOpenGL from trying the next.
-
-    Raises:
-        RenderingUnavailable: if there is none.
+    Raises RenderingUnavailable if there is none.
     """
     wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
     if wanted:
@@ -111,7 +109,6 @@ def choose_gl() -> str:
 
 
 def _why_not(name: str) -> str:
-    """Return why a GL library does not work on this machine; empty if it does."""
     try:
         done = subprocess.run(
             [sys.executable, "-c", _PROBE.format(name=name)], capture_output=True, text=True, timeout=60
@@ -124,7 +121,6 @@ def _why_not(name: str) -> str:
 
 
 def _contexts(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoco.MjrContext]:
-    """Return an off-screen GL context of that size, made current, and MuJoCo's own in it."""
     name = choose_gl()
     try:
         gl = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
@@ -293,13 +289,10 @@ def _close(camera: weakref.ref[Camera]) -> None:
 
 
 def draw_velocities(scene: mujoco.MjvScene, stage: Stage, command: Tensor, velocity: NDArray[np.float64]) -> None:
-    """Add arrows above the robot to a scene: commanded (blue) and actual (green) velocity.
+    """Add arrows above the robot on ``stage`` to a scene: commanded (blue) and actual (green) velocity.
 
-    Args:
-        scene: to add them to.
-        stage: where the robot is.
-        command: (3,) x and y in the robot's frame, m/s; the yaw rate is not drawn.
-        velocity: (2,) in the world's frame, m/s.
+    ``command`` (3,) is x and y in the robot's frame, m/s, and the yaw rate, which is not drawn; ``velocity`` (2,) is in
+    the world's frame, m/s.
     """
     heading = stage.heading()
     cos, sin = math.cos(heading), math.sin(heading)

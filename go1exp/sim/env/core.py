@@ -110,7 +110,6 @@ class Go1Core:
         self._captured: CapturedStep | None = None
 
     def _build_ground(self, first_env: int) -> None:
-        """Prepare height lookup, tiles and the place of each environment on them."""
         t, to_device = self.terrain, partial(torch.as_tensor, dtype=torch.float32, device=self.device)
         self._ground = GroundHeight(to_device(t.heights), t.x0, t.y0, t.resolution)
         self._origins = to_device(t.tile_origins)
@@ -186,7 +185,6 @@ class Go1Core:
         self._started = False
 
     def _randomize_model(self, when: str, mask: Tensor) -> None:
-        """Draw the model terms of ``when`` in the rows of ``mask``."""
         due = [t for t in self._model_terms if t.slots["when"] == when]
         for term in due:
             term(self.backend, self.random.stream(f"rand.{term.key}"), mask)
@@ -194,7 +192,6 @@ class Go1Core:
             self.backend.derive_constants(mask)
 
     def _restart(self, mask: Tensor) -> None:
-        """Put the rows of ``mask`` at the start of a new episode."""
         self._randomize_model("reset", mask)
         rows = mask.unsqueeze(1)
         self.spawn.copy_(torch.where(rows, self._origins[self.level, self.tile_column], self.spawn))
@@ -264,7 +261,6 @@ class Go1Core:
         return StepResult(observation, reward, terminated, truncated, final_observation, episode_return, episode_length)
 
     def _advance_physics(self, action: Tensor) -> None:
-        """Run the substeps of one policy step."""
         self.previous_action.copy_(self.action)
         self.action.copy_(limited(of_shape(action, self.action.shape), self.previous_action, *self.task.action.limits))
         self._last_action.copy_(self.action)
@@ -289,7 +285,6 @@ class Go1Core:
             happening.advance(self._state, self.task.sim.policy_dt, restart)
 
     def _move_levels(self, ended: Tensor, fallen: Tensor) -> None:
-        """Apply the curriculum to the episodes that ended."""
         for rule in self._curriculum:
             tracked, commanded = self.path.lengths().unbind(1)
             whole = (self.task.sim.episode_steps - self._first_step) / (self.steps - self._first_step)
@@ -379,7 +374,6 @@ class Go1Core:
     )
 
     def _parts(self) -> dict[str, Any]:
-        """Everything with a state of its own."""
         names = ("backend", "random", "plant", "command", "feet", "gait_log", "task_log")
         path = {"path": self.path} if self._curriculum else {}
         events = {f"event.{name}": part for name, part in self.events.items()}

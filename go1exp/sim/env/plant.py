@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,7 +25,7 @@ from go1exp.config.schema.registry import ConfigError, Term
 from go1exp.mdp.types import Snapshot
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.robot.config import RobotConfig
-from go1exp.sim.actuator.motors import Actuator, TakesFeedforward, takes_feedforward
+from go1exp.sim.actuator.motors import Actuator, takes_feedforward
 from go1exp.sim.effects.base import Measured
 from go1exp.sim.effects.stack import EffectStack
 from go1exp.sim.physics.backend import PhysicsBackend
@@ -204,7 +204,6 @@ class Plant:
             self._rotors.follow(self.joint_acceleration())
 
     def _fed_forward(self, command: Tensor, encoder: tuple[Tensor, Tensor], feedforward: Tensor | None) -> Tensor:
-        """Return the actuators' torque for a target, with the torque that is fed forward."""
         if self._fed is None:
             if not takes_feedforward(self.actuator):
                 kind, known = type(self.actuator).__name__, "use actuator=pd, dc_motor, voltage, delay or net"
@@ -213,7 +212,7 @@ class Plant:
         given = torch.zeros_like(self._fed) if feedforward is None else feedforward
         arriving = self.effects.through("on_feedforward", torch.lerp(self._fed, given, 0.5))
         self._fed.copy_(given)
-        return cast("TakesFeedforward", self.actuator).torque(command, *encoder, arriving)
+        return self.actuator.torque(command, *encoder, arriving)  # type: ignore[call-arg]
 
     def _apply_joint_torques(self, geared: Tensor, q: Tensor, qd: Tensor, turn: Tensor | None) -> Tensor:
         """Apply joint torques other than the actuator's ``geared``; return the part of that which acts rigidly."""

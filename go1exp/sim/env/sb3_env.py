@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from numbers import Real
 from typing import Any
 
@@ -21,12 +20,8 @@ from go1exp.sim.env.core import Go1Core
 def spaces(core: Go1Core, action_box: float | None = None) -> tuple[gym.spaces.Box, gym.spaces.Box]:
     """Return the observation and action space of one environment.
 
-    Args:
-        core: the environment.
-        action_box: the action space is +-``action_box``, at most ``action.clip``, which is meant by None.
-
-    Raises:
-        ConfigError: if ``action_box`` is not positive.
+    The action space is +-``action_box``, at most ``action.clip``, which is meant by None. Raises ConfigError if
+    ``action_box`` is not positive.
     """
     clip = core.task.action.clip
     if action_box is not None:
@@ -113,7 +108,7 @@ class Go1VecEnv(VecEnv):
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of the core, once per environment asked for; raise AttributeError if it has none."""
         value = None if attr_name == "render_mode" else getattr(self.core, attr_name)
-        return [value] * self._count(indices)
+        return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: object, indices: VecEnvIndices = None) -> None:
         """Refuse: the environments share one core."""
@@ -125,9 +120,4 @@ class Go1VecEnv(VecEnv):
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """Nothing is wrapped."""
-        return [False] * self._count(indices)
-
-    def _count(self, indices: VecEnvIndices) -> int:
-        if indices is None:
-            return self.core.num_envs
-        return len(indices) if isinstance(indices, Sequence | Iterable) else 1  # type: ignore[arg-type]
+        return [False for _ in self._get_indices(indices)]

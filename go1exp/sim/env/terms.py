@@ -108,9 +108,7 @@ class Frames(Memory):
     def ended(self, frame: Tensor, unit: Tensor | None) -> Tensor:
         """Return the observation (N, O) at the end of a step, before any robot begins anew.
 
-        Args:
-            frame: (N, F) values of the terms.
-            unit: (N, F) uniform from -1 to 1; None for no noise.
+        ``frame`` (N, F) has the values of the terms; ``unit`` (N, F) is uniform from -1 to 1, None for no noise.
         """
         if unit is not None:
             if len(self._kept):
@@ -122,10 +120,8 @@ class Frames(Memory):
     def begun(self, frame: Tensor, unit: Tensor | None, anew: Tensor) -> Tensor:
         """Return what the policy sees next (N, O), and keep its frame for later steps.
 
-        Args:
-            frame: as for ``ended``.
-            unit: as for ``ended``.
-            anew: (N,) bool, robots whose episode begins: their earlier frames are all the first one.
+        ``frame`` and ``unit`` are as for ``ended``; ``anew`` (N,) bool are robots whose episode begins: their earlier
+        frames are all the first one.
         """
         rows = anew.unsqueeze(1)
         if unit is not None:
@@ -282,11 +278,7 @@ class StepTerms:
         )
 
     def _shaped(self, group: str, term: Term, value: Tensor) -> Tensor:
-        """Return what a term gave, if it is one value, or an observation's ``size``, for each robot.
-
-        Raises:
-            ConfigError: if not. One number for all robots would be spread over them without a word.
-        """
+        """Return what a term gave; raise ConfigError unless it is one value, or ``size`` of them, for each robot."""
         if not isinstance(value, Tensor):
             raise ConfigError([f"{group}.{term.key}: gives {type(value).__name__}, must be a tensor"])
         size = (frame_width(term),) if group == "observation" else ()

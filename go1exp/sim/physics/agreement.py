@@ -86,11 +86,7 @@ class Check:
 
 
 def require(reference: PhysicsBackend, engine: PhysicsBackend, name: str) -> list[Check]:
-    """Return the checks of an engine that agrees with the reference.
-
-    Raises:
-        Expected: if it does not, with everything that differs in one line.
-    """
+    """Return the checks of an engine that agrees with the reference; else raise Expected with all that differs."""
     checks = compare(reference, engine)
     if failed := [str(check) for check in checks if not check.holds]:
         raise Expected(
@@ -136,7 +132,6 @@ def built(engine: PhysicsBackend) -> Built:
 
 
 def _unlike(names: Sequence[str], others: Sequence[str]) -> int:
-    """Return the number of places at which names differ."""
     return sum(a != b for a, b in zip_longest(names, others))
 
 
@@ -157,7 +152,6 @@ def _poses(count: int, spread: float, seed: int) -> np.ndarray:
 
 
 def _put(engine: PhysicsBackend, qpos: np.ndarray, qvel: np.ndarray) -> None:
-    """Put all robots into states given on the host."""
     like = engine.qpos
     engine.applied().zero_()
     mask = torch.ones(engine.num_envs, dtype=torch.bool, device=like.device)

@@ -106,12 +106,7 @@ def _rename(spec: mujoco.MjSpec, base: str, joints: Sequence[str]) -> dict[str, 
 
 
 def _cause(error: ValueError, given: Mapping[str, str]) -> str:
-    """Return what MuJoCo's compiler refuses, with the file's names of bodies.
-
-    Args:
-        error: the compiler's.
-        given: name of a body in the compiled model -> that in the file.
-    """
+    """Return what MuJoCo's compiler refuses; ``given``: name of a body in the compiled model -> that in the file."""
     text = _in_a_line(error)
     body = re.search(r"inertia.* Element name '([^']*)'", text)
     if body is None:
@@ -128,7 +123,6 @@ def _in_a_line(error: ValueError) -> str:
 
 
 def _checked(spec: mujoco.MjSpec, file: Path, base: str, joints: Sequence[str]) -> None:
-    """Raise what is wrong with the names."""
     bodies, hinges = [b.name for b in spec.bodies], {}
     if base not in bodies[1:]:
         known = ", ".join(name for name in bodies[1:] if name)

@@ -50,7 +50,6 @@ class MujocoCpu:
         self._applied: Tensor | None = None
 
     def _output(self, name: str) -> Tensor:
-        """Return live values that the engine writes."""
         with warnings.catch_warnings():  # shared read-only: torch has no such notion
             warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
             return torch.from_numpy(self._batch.bind(name))

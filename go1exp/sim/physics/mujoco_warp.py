@@ -188,7 +188,6 @@ class MujocoWarp:
         return self._fields[name]
 
     def _place(self, name: str) -> tuple[object, str]:
-        """Return the object that holds a field, and its name there."""
         *path, attribute = name.split(".")
         return (attrgetter(".".join(path))(self._model) if path else self._model), attribute
 

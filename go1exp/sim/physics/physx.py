@@ -63,11 +63,7 @@ class PhysxCpu(MujocoCpu):
     """N robots, each in a PhysX system of its own (see ``PhysicsBackend``)."""
 
     def __init__(self, model: mujoco.MjModel, sensors: Sensors, num_envs: int, settings: PhysxBackend) -> None:
-        """Build the robots; ``settings.threads`` = 0 takes all cores.
-
-        Raises:
-            go1exp.config.schema.registry.Expected: if the model has a part that is not translated to PhysX.
-        """
+        """Build the robots on ``settings.threads``, 0 for all cores; raise Expected for a part not translated."""
         kinematics = copy.copy(model)
         kinematics.opt.disableflags |= int(NO_DYNAMICS)
         super().__init__(kinematics, sensors, num_envs, settings.threads)
@@ -91,11 +87,7 @@ class PhysxCpu(MujocoCpu):
     # ------------------------------------------------------------------ the model
 
     def field(self, name: str) -> Tensor:
-        """Live per-environment values of a model field.
-
-        Raises:
-            ConfigError: if PhysX cannot give robots their own.
-        """
+        """Live per-environment values of a model field; raise ConfigError if PhysX cannot give robots their own."""
         if name not in (*APPLIED, *BY_MUJOCO, *DERIVED, *self._fields):
             raise ConfigError([f"engine = physx: robots cannot differ in {name}: {RIGID.get(name, 'not supported')}"])
         live = super().field(name)
@@ -106,7 +98,6 @@ class PhysxCpu(MujocoCpu):
         return live
 
     def _refresh_fields(self) -> None:
-        """Give PhysX what has changed in the robots' models since the last step."""
         for name, old in self._in_force.items():
             live = self._fields[name]
             rows = (live != old).flatten(1).any(1)
@@ -148,7 +139,6 @@ class PhysxCpu(MujocoCpu):
         self._put(rows)
 
     def _advance(self, rows: Sequence[int]) -> None:
-        """Step those robots, read where they are then, and what their sensors said."""
         every = len(rows) == self.num_envs
         self._batch.forward(None if every else np.asarray(rows))
         before = self.qpos.clone(), self.qvel.clone()
@@ -164,7 +154,6 @@ class PhysxCpu(MujocoCpu):
         self._sense(torch.as_tensor(rows), *before)
 
     def _push(self, rows: Sequence[int]) -> None:
-        """Give the robots the torques and forces of the step."""
         joints = self._out["qfrc_smooth"] + self._out["qfrc_bias"]  # all but gravity and inertia
         torque = np.empty((self.num_envs, len(self._order)), dtype=np.float32)
         torque[:, self._order] = joints[:, -len(self._order) :]
@@ -196,7 +185,6 @@ class PhysxCpu(MujocoCpu):
     # ------------------------------------------------------------------ state
 
     def _put(self, rows: Tensor) -> None:
-        """Give PhysX the state of those rows."""
         joints = len(self._order)
         pairs = torch.stack([self.qpos[:, -joints:], self.qvel[:, -joints:]], 1).float().numpy()
         root = self._root_to_physx().numpy() if self._floating else None
@@ -212,7 +200,6 @@ class PhysxCpu(MujocoCpu):
         return torch.cat([self.qpos[:, :7], self.qvel[:, :3] + torch.linalg.cross(turn, centre), turn], 1)
 
     def _read(self, rows: Sequence[int], robots: list[PhysxRobot]) -> None:
-        """Read the state of those robots into ``qpos`` and ``qvel``."""
         index, joints = torch.as_tensor(rows), len(self._order)
         raw = torch.as_tensor(np.stack([one.read() for one in robots])).double()
         self.qpos[index, -joints:] = raw[:, 13 : 13 + joints][:, self._order]
@@ -294,6 +281,5 @@ class PhysxCpu(MujocoCpu):
 
 
 def _step_all(robots: list[PhysxRobot]) -> None:
-    """Step robots one after the other."""
     for one in robots:
         one.system.step()

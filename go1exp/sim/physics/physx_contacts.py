@@ -54,7 +54,6 @@ class Contacts:
                 self._add(env, first, second, count, total)
 
     def _add(self, env: int, first: int, second: int, count: int, impulse: list[float]) -> None:
-        """Add the points of one pair of geoms, and the impulse on the first."""
         geom, sign = (second, -1.0) if first == self._floor else (first, 1.0)
         self.body_points[env, self._body[geom]] += count
         if (leg := self._foot.get(geom)) is not None:

@@ -63,9 +63,7 @@ def ground_shape(model: mujoco.MjModel, settings: PhysxBackend) -> physx.PhysxCo
     """Return the ground as one shape that all robots' systems share: a plane, or a height field's triangles.
 
     A cell of the field is split along the diagonal along which MuJoCo splits it (``go1exp.sim.terrain.Terrain``).
-
-    Raises:
-        Expected: if the floor is something else.
+    Raises Expected if the floor is something else.
     """
     floor, smooth = model.geom(FLOOR), physx.PhysxMaterial(0.0, 0.0, 0.0)
     if floor.type == mujoco.mjtGeom.mjGEOM_PLANE:
@@ -113,11 +111,7 @@ class PhysxRobot:
     """
 
     def __init__(self, model: mujoco.MjModel, settings: PhysxBackend, ground: physx.PhysxCollisionShape) -> None:
-        """Build it.
-
-        Raises:
-            Expected: if the model has joints or shapes other than a Go1's.
-        """
+        """Build it; raise Expected if the model has joints or shapes other than a Go1's."""
         self._model, self._settings = model, settings
         self.shapes = {ground: model.geom(FLOOR).id}
         physx.set_scene_config(gravity=model.opt.gravity, enable_tgs=settings.solver == "tgs")
@@ -145,7 +139,6 @@ class PhysxRobot:
     # ------------------------------------------------------------------ construction
 
     def _link(self, body: int) -> physx.PhysxArticulationLinkComponent:
-        """Make one link with its shapes and its joint."""
         model, parent = self._model, int(self._model.body_parentid[body])
         link = physx.PhysxArticulationLinkComponent(self.links[parent - 1] if parent else None)
         link.name = model.body(body).name
@@ -187,7 +180,6 @@ class PhysxRobot:
         hinge.set_drive_properties(0.0, *dry_friction(float(model.dof_frictionloss[dof])))
 
     def _shape(self, geom: int) -> physx.PhysxCollisionShape:
-        """Make a collision shape of a geom."""
         model, size = self._model, self._model.geom_size[geom]
         mu = 2.0 * float(pair_friction(model, geom, model.geom_friction))
         material, turned = physx.PhysxMaterial(mu, mu, 0.0), rotation(model.geom_quat[geom])
@@ -275,10 +267,7 @@ def dry_friction(bound: float) -> tuple[float, float]:
 def pair_friction(model: mujoco.MjModel, geom: int, friction: np.ndarray) -> np.ndarray:
     """Return a geom's sliding friction with the ground by MuJoCo's rule: the higher priority's, else the larger.
 
-    Args:
-        model: whose priorities count.
-        geom: the geom.
-        friction: ``geom_friction`` of any number of robots (..., geoms, 3); the answer has the shape (...).
+    ``friction``: ``geom_friction`` of any number of robots (..., geoms, 3); the answer has the shape (...).
     """
     floor = model.geom(FLOOR).id
     first, second = model.geom_priority[geom], model.geom_priority[floor]

@@ -88,7 +88,6 @@ class Ray:
             ray.shutdown()  # of a private one, the processes; of another, our connection: its tasks of ours end
 
     def _connect(self) -> None:
-        """Reach the cluster, or start one."""
         for name, value in QUIET.items():
             os.environ.setdefault(name, value)
         import ray
@@ -126,11 +125,7 @@ class Ray:
 
 
 def _refuse_silence(address: str | None) -> None:
-    """Refuse an address at which no server listens: Ray itself would try for minutes.
-
-    Raises:
-        Expected: naming it.
-    """
+    """Raise Expected naming an address at which no server listens: Ray itself would try for minutes."""
     host, colon, port = (address or "").removeprefix("ray://").rpartition(":")
     if not colon or not port.isdigit():
         return
@@ -142,11 +137,7 @@ def _refuse_silence(address: str | None) -> None:
 
 
 def _follow(ray: ModuleType, tasks: dict[Any, Task], watch: Watch) -> None:
-    """Tell of each task when it ends, and now and then of those that have begun.
-
-    Raises:
-        Expected: if the cluster leaves.
-    """
+    """Tell of each task when it ends, now and then of those that have begun; raise Expected if the cluster leaves."""
     left = list(tasks)
     while left:
         ended, left = ray.wait(left, num_returns=1, timeout=LOOK_S)

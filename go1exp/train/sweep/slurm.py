@@ -149,7 +149,6 @@ class Slurm:
             raise
 
     def _submitted(self, place: Path, name: str, tasks: Sequence[Task]) -> dict[str, str]:
-        """Hand the tasks in as one array; return run folder -> id of its job."""
         import submitit
 
         wanted = self.settings
@@ -200,11 +199,7 @@ class Slurm:
 
 
 def _asked(*words: str) -> str:
-    """Return what one of Slurm's commands prints.
-
-    Raises:
-        Expected: if the controller does not answer.
-    """
+    """Return what one of Slurm's commands prints; raise Expected if the controller does not answer."""
     try:
         done = subprocess.run(words, capture_output=True, text=True, timeout=ANSWER_S)
     except subprocess.TimeoutExpired:

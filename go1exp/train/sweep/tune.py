@@ -106,13 +106,7 @@ class Search:
     def __init__(
         self, settings: TuneSettings, ranges: dict[str, Range], plan: Callable[[Sequence[str], Path], None]
     ) -> None:
-        """Prepare it.
-
-        Args:
-            settings: of the search.
-            ranges: key of a setting -> what it is drawn from.
-            plan: ``(overrides, run folder)``, makes the folder of a trial; raises ConfigError.
-        """
+        """Prepare it; ``plan(overrides, run folder)`` makes the folder of a trial and raises ConfigError."""
         self.settings, self.ranges, self.plan = settings, ranges, plan
         self.folder = Path(settings.out).absolute()
         self._lock = threading.Lock()
@@ -145,7 +139,6 @@ class Search:
         return study.best_trial if finished else None
 
     def _study(self) -> Study:
-        """Open Optuna's study."""
         import optuna
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -222,7 +215,6 @@ class Search:
             print(f"trial {trial.number}: {result}  {words}", flush=True)
 
     def _train(self, trial: Trial, run: Path, share: tuple[int, ...]) -> tuple[Ended, list[tuple[int, float]], bool]:
-        """Run a trial's training; return how it ended, its metric by iteration, and whether it was hopeless."""
         words = (sys.executable, "-m", "go1exp.cli.child", PARENT, CORES, "train", f"resume='{run}'")
         command = Command(
             (*words, f"hydra.run.dir='{run}'", "hydra.output_subdir=null"), os.getcwd(), str(run / "job.log")
@@ -248,7 +240,6 @@ class Search:
         return ended[0], self._values(run), hopeless
 
     def _values(self, run: Path) -> list[tuple[int, float]]:
-        """Return iteration and averaged metric, at each row that has the metric."""
         rows, newest = list(logged(run, self.settings.metric)), self.settings.average
         return [
             (iteration, sum(v for _, v in rows[max(0, k + 1 - newest) : k + 1]) / min(k + 1, newest))
@@ -256,7 +247,6 @@ class Search:
         ]
 
     def _stop(self) -> None:
-        """Have the trainings save a checkpoint and end."""
         self._stopping = True
         if self._running:
             print(f"\nstopping {len(self._running)} trials after the iteration under way", file=sys.stderr, flush=True)
