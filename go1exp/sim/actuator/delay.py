@@ -11,7 +11,7 @@ from pydantic_core import PydanticCustomError
 from go1exp.base.tensors.memory import CommandLine
 from go1exp.config.schema.registry import actuator, bind, members, ordered
 from go1exp.robot.actuators import ActuatorSetup
-from go1exp.sim.actuator.motors import Actuator
+from go1exp.sim.actuator.motors import Actuator, takes_feedforward
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -91,8 +91,8 @@ class Delay:
         delayed = self._line.at(target, steps)
         if feedforward is None:
             return self.drive.torque(delayed, q, qd)
-        fed = self._line.fed(feedforward, steps)
-        return self.drive.torque(delayed, q, qd, fed)  # type: ignore[call-arg]  # the plant has asked
+        assert takes_feedforward(self.drive)  # the plant has asked
+        return self.drive.torque(delayed, q, qd, self._line.fed(feedforward, steps))
 
     def reset(self, mask: Tensor) -> None:
         """Draw new delays in the rows of ``mask`` (N,) and take the next target for one long in force."""

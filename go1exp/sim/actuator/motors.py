@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeGuard, runtime_checkable
 
 import torch
 
@@ -23,7 +23,7 @@ class Actuator(Protocol):
         """Return joint torques (N, J), N m, for targets and angles in rad and speeds in rad/s.
 
         An actuator that can be fed forward has a fourth argument, ``feedforward: Tensor | None = None``, (N, J), N m:
-        added to its own torque before the limit, as a Go1's motors add ``LowCmd.tau``, and delayed as the target is.
+        added to its own torque before the limit, and delayed as the target is (``TakesFeedforward``).
         """
 
     def reset(self, mask: Tensor) -> None:
@@ -36,11 +36,31 @@ class Actuator(Protocol):
         """Continue with that history."""
 
 
-def takes_feedforward(actuator: Actuator) -> bool:
+class TakesFeedforward(Actuator, Protocol):
+    """An actuator to which a torque can be added, as a Go1's motors add ``LowCmd.tau``."""
+
+    def torque(self, target: Tensor, q: Tensor, qd: Tensor, feedforward: Tensor | None = None) -> Tensor:
+        """Return joint torques (N, J), N m, that of the law plus ``feedforward``, within the actuator's limit."""
+
+
+def takes_feedforward(actuator: Actuator) -> TypeGuard[TakesFeedforward]:
     """Return whether an actuator, and the one that it may wrap, can be fed forward."""
     inner = getattr(actuator, "drive", None)
     itself = "feedforward" in inspect.signature(actuator.torque).parameters
     return itself and (inner is None or takes_feedforward(inner))
+
+
+@runtime_checkable
+class HasGains(Protocol):
+    """An actuator whose gains, both (N, J), can be written in place: its own or the wrapped actuator's."""
+
+    @property
+    def kp(self) -> Tensor:
+        """N m/rad."""
+
+    @property
+    def kd(self) -> Tensor:
+        """N m s/rad."""
 
 
 class Gains(Memory):

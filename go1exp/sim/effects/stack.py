@@ -11,6 +11,7 @@ from torch import Tensor
 from go1exp.config.schema.joint_values import spread
 from go1exp.config.schema.registry import Term
 from go1exp.robot.actuators import ActuatorSetup, ModelFields
+from go1exp.sim.actuator.motors import Actuator, HasGains
 from go1exp.sim.effects.base import Effect, Gears, Measured
 from go1exp.sim.effects.gears import TwoMass
 from go1exp.sim.physics.backend import PhysicsBackend
@@ -96,12 +97,10 @@ class EffectStack:
         for effect in self.effects.values():
             effect.prepare()
 
-    def set_gains(self, actuator: Any, kp: Tensor, kd: Tensor) -> None:
-        """Give the actuator the gains that it really has, from those of its configuration.
-
-        Its ``kp`` and ``kd``, both (N, J), are written in place; one without them has been refused with such an effect.
-        """
+    def set_gains(self, actuator: Actuator, kp: Tensor, kd: Tensor) -> None:
+        """Give the actuator the gains that it really has, from those of its configuration."""
         if self._acting["on_gains"]:
+            assert isinstance(actuator, HasGains)  # the configuration has been checked
             for effect in self._acting["on_gains"]:
                 kp, kd = effect.on_gains(kp, kd)
             actuator.kp.copy_(kp)

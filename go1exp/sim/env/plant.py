@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -25,7 +25,7 @@ from go1exp.config.schema.registry import ConfigError, Term
 from go1exp.mdp.types import Snapshot
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.robot.config import RobotConfig
-from go1exp.sim.actuator.motors import Actuator, takes_feedforward
+from go1exp.sim.actuator.motors import Actuator, TakesFeedforward, takes_feedforward
 from go1exp.sim.effects.base import Measured
 from go1exp.sim.effects.stack import EffectStack
 from go1exp.sim.physics.backend import PhysicsBackend
@@ -212,7 +212,7 @@ class Plant:
         given = torch.zeros_like(self._fed) if feedforward is None else feedforward
         arriving = self.effects.through("on_feedforward", torch.lerp(self._fed, given, 0.5))
         self._fed.copy_(given)
-        return self.actuator.torque(command, *encoder, arriving)  # type: ignore[call-arg]
+        return cast("TakesFeedforward", self.actuator).torque(command, *encoder, arriving)
 
     def _apply_joint_torques(self, geared: Tensor, q: Tensor, qd: Tensor, turn: Tensor | None) -> Tensor:
         """Apply joint torques other than the actuator's ``geared``; return the part of that which acts rigidly."""
