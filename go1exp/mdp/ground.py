@@ -59,7 +59,12 @@ class GroundHeight:
 
 
 class HeightScan:
-    """Heights of the ground on a grid about each robot, level, and turned with its heading; ``ground`` None is flat."""
+    """Heights of the ground on a grid about each robot, level, and turned with the robot's heading.
+
+    Args:
+        ground: lookup of heights; None for flat ground at height 0.
+        device: of the grid.
+    """
 
     def __init__(self, ground: GroundHeight | None, device: torch.device) -> None:
         self._ground = ground
@@ -76,7 +81,12 @@ class HeightScan:
 
 
 class RiseAhead:
-    """How far the ground ahead of each foot rises over the ground below the foot; ``ground`` None is flat."""
+    """How far the ground ahead of each foot rises over the ground below the foot.
+
+    Args:
+        ground: lookup of heights; None for flat ground.
+        device: of the distances.
+    """
 
     def __init__(self, ground: GroundHeight | None, device: torch.device) -> None:
         self._ground, self._distances = ground, torch.tensor(AHEAD, device=device).unsqueeze(1)
@@ -98,9 +108,12 @@ class RiseAhead:
 
 
 class Surroundings:
-    """The fields of a Snapshot that are computed only because a term reads them; ``ground`` None is flat, at 0 m.
+    """The fields of a Snapshot that are computed only because a term reads them.
 
-    Of the names in ``read``, others than ``height_scan`` and ``foot_rise`` are not looked at.
+    Args:
+        ground: lookup of heights; None for flat ground at height 0.
+        device: of the robots.
+        read: names of the fields; others than ``height_scan`` and ``foot_rise`` are not looked at.
     """
 
     def __init__(self, ground: GroundHeight | None, device: torch.device, read: Collection[str]) -> None:

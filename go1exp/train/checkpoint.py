@@ -46,8 +46,10 @@ def iterations_done(run: Path) -> int:
 def save(ppo: AdaptivePPO, run: Path, keep: int) -> Path:
     """Write the present state as the newest checkpoint and delete all but ``keep``.
 
-    In a group all members call this, and the first one writes the state of all robots. Raises OSError if it cannot be
-    written; the checkpoints that are there stay.
+    In a group all members call this, and the first one writes the state of all robots.
+
+    Raises:
+        OSError: if it cannot be written; the checkpoints that are there stay.
     """
     final = run / "checkpoints" / f"{ppo.iteration:06d}{SUFFIX}"
     state = _state(ppo)
@@ -69,7 +71,9 @@ def save(ppo: AdaptivePPO, run: Path, keep: int) -> Path:
 def load_latest(run: Path) -> tuple[dict[str, Any], Path]:
     """Read the newest checkpoint that is whole; a damaged one is skipped with a warning of one line.
 
-    Raises FileNotFoundError if the folder holds none, DamagedCheckpoint if none of those that it holds can be read.
+    Raises:
+        FileNotFoundError: if the folder holds none.
+        DamagedCheckpoint: if none of those that it holds can be read.
     """
     files = checkpoints(run)
     for path in reversed(files):

@@ -76,8 +76,9 @@ class DeviceRolloutBuffer(MeanRolloutBuffer):
     def estimate(self, last_values: Tensor, last_ended: Tensor) -> None:
         """Compute advantages and returns, and join the rollouts of the group.
 
-        ``last_values`` (n,) are of the states after the rollout; ``last_ended`` (n,) says whether an episode ended in
-        its last step.
+        Args:
+            last_values: (n,) of the states after the rollout.
+            last_ended: (n,) whether an episode ended in its last step.
         """
         d = self.data
         write_advantages(
@@ -124,9 +125,14 @@ class DeviceRolloutBuffer(MeanRolloutBuffer):
 
 
 class DeviceUpdate:
-    """All gradient steps of an iteration; ``captures`` records the step as a CUDA graph, else it is made call by call.
+    """All gradient steps of an iteration.
 
     The memory of policy and optimiser must stay where it is from the first call on: restore checkpoints before it.
+
+    Args:
+        ppo: the learner.
+        buffer: its rollouts.
+        captures: record the gradient step as a CUDA graph; else make its calls one by one.
     """
 
     def __init__(self, ppo: AdaptivePPO, buffer: DeviceRolloutBuffer, captures: bool) -> None:

@@ -150,9 +150,14 @@ def _table(rows: Sequence[Mapping[str, object]]) -> Any:
 def log_tables(
     tables: Mapping[str, Sequence[Mapping[str, Any]]], page: Path, project: str, how: str, folder: Path
 ) -> None:
-    """Log the tables of a report, rows by name, and its HTML page as a run of its own in a project of Weights & Biases.
+    """Log the tables of a report, and its page, as a run of its own.
 
-    ``how`` is offline, where the run is left in ``folder``, or online.
+    Args:
+        tables: rows by name.
+        page: HTML file.
+        project: of Weights & Biases.
+        how: offline or online.
+        folder: where an offline run is left.
     """
     wandb = _wandb()
     run = wandb.init(
@@ -180,7 +185,8 @@ def _of_one_kind(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def check_account(config: LoggerConfig) -> None:
     """Refuse to log online to Weights & Biases without a key: it would ask, or fail, when all is built.
 
-    Raises ConfigError if neither the environment nor a netrc file holds one.
+    Raises:
+        ConfigError: if neither the environment nor a netrc file holds one.
     """
     if config.wandb is None or wandb_mode(config.wandb) != "online":
         return
@@ -314,9 +320,14 @@ def dump_late(logger: Logger, steps: int) -> None:
 
 
 def make_logger(config: LoggerConfig, run: Path, iteration: int, settings: dict[str, object], steps: int = 0) -> Logger:
-    """Build SB3's logger with the configured writers, in the folder ``run``; Weights & Biases gets ``settings``.
+    """Build SB3's logger with the configured writers.
 
-    Training continues from ``iteration``, after ``steps`` environment steps: later rows are dropped.
+    Args:
+        config: which ones.
+        run: the run folder.
+        iteration: that training continues from: later rows are dropped.
+        settings: the run's configuration, for Weights & Biases.
+        steps: environment steps at ``iteration``.
     """
     writers: list[KVWriter] = []
     if config.tensorboard:

@@ -139,8 +139,13 @@ class TwoNetworks(MlpExtractor):
 class GaussianPolicy(ActorCriticPolicy):
     """SB3's actor-critic, which remembers the distribution of its last forward pass.
 
-    The actor sees the first ``policy_size`` columns of the observation, the critic all; ``bf16``, ``estimator`` and
-    ``critic_widths`` are as for ``TwoNetworks``.
+    Args:
+        *args: SB3's.
+        policy_size: columns of the observation that the actor sees, the first ones; the critic sees all.
+        bf16: as for ``TwoNetworks``, and so are the next two.
+        estimator: of the actor.
+        critic_widths: of the terms that the critic alone sees.
+        **kwargs: SB3's.
     """
 
     mlp_extractor: TwoNetworks

@@ -37,10 +37,15 @@ class Weights:
 
 
 def read_weights(config: TrainConfig, source: Path) -> Weights:
-    """Return the weights of the newest checkpoint of ``source``, a run folder or that of a shipped policy.
+    """Return the weights of ``source``'s newest checkpoint.
 
-    Raises ConfigError if a policy of the new run, of ``config``, is another function than one of ``source``, and
-    FileNotFoundError if that holds no checkpoint.
+    Args:
+        config: the new run's.
+        source: run folder, or that of a shipped policy.
+
+    Raises:
+        ConfigError: if a policy of the new run is another function than one of ``source``.
+        FileNotFoundError: if ``source`` holds no checkpoint.
     """
     with plugins.restored():
         theirs = run_folder.read_parsed(source)
@@ -100,8 +105,9 @@ Policy = Callable[[Tensor], Tensor]
 def load_run(run: Path, which: Path | None = None) -> tuple[TrainConfig, Policy, dict[str, Any]]:
     """Load a run by its own configuration; return that, its policy, and the description that ``load_policy`` returns.
 
-    Raises FileNotFoundError if ``run`` is no run folder or has no checkpoint, ConfigError if its configuration is not
-    one that this version knows.
+    Raises:
+        FileNotFoundError: if ``run`` is not a run folder or has no checkpoint.
+        go1exp.config.schema.registry.ConfigError: if its configuration is not one that this version knows.
     """
     config = run_folder.read_parsed(run)
     policy, about = load_policy(run, config, which)

@@ -70,7 +70,11 @@ def warn_of_idle_curriculum(config: TrainConfig) -> None:
 
 
 def check_shares(config: TrainConfig) -> None:
-    """Refuse a training that cannot be shared out over its GPUs: ConfigError naming what would have to be different."""
+    """Refuse a training that cannot be shared out over the GPUs asked for.
+
+    Raises:
+        ConfigError: naming what would have to be different.
+    """
     devices, ppo, backend = config.process.devices, config.ppo, config.task.backend
     if devices == 1:
         return
@@ -88,7 +92,11 @@ def check_shares(config: TrainConfig) -> None:
 
 
 def check_devices(config: TrainConfig) -> None:
-    """Raise ConfigError naming devices, engines and a video writer that are not there (SB3 would take the CPU)."""
+    """Refuse devices, engines and a video writer that are not there (SB3 would quietly take another device).
+
+    Raises:
+        ConfigError: naming each.
+    """
     backend, problems = config.task.backend, []
     wanted = [("device", config.process.device, "device=cpu")]
     if isinstance(backend, WarpBackend):
@@ -133,7 +141,15 @@ def needed_bytes(config: TrainConfig) -> int:
 
 
 def check_memory(config: TrainConfig, device: torch.device) -> None:
-    """Refuse a training that cannot fit, most of it on ``device``: ConfigError with what it takes and what there is."""
+    """Refuse a training that cannot fit.
+
+    Args:
+        config: what is to be trained.
+        device: where most of it lies.
+
+    Raises:
+        ConfigError: with what it takes and what there is.
+    """
     needed, available = needed_bytes(config), free_on(device)
     ground, free = config.task.terrain, memory.free()
     samples = math.prod(ground.shape) if ground.kind == "tiles" else 0

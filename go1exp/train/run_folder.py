@@ -43,7 +43,11 @@ PACKAGES = ("torch", "stable-baselines3", "gymnasium", "mujoco-core", "numpy", "
 
 
 def write(run: Path, container: Mapping[str, object]) -> None:
-    """Create a run folder with configuration and versions of the run; raise OSError naming it if that fails."""
+    """Create a run folder with configuration and versions of the run.
+
+    Raises:
+        OSError: if the folder cannot be written; the message names it.
+    """
     try:
         run.mkdir(parents=True, exist_ok=True)
         meta = {**_meta(container), "plugins": keep_plugins(run, container)}
@@ -71,7 +75,9 @@ def _with_files(actuator: object) -> Iterator[dict[str, Any]]:
 def read_config(run: Path) -> dict[str, Any]:
     """Return the run's own resolved configuration; an actuator's file and plugins are the run's own copies.
 
-    Raises FileNotFoundError if ``run`` is no run folder, ConfigError if a plugin that it was trained with is missing.
+    Raises:
+        FileNotFoundError: if ``run`` is not a run folder.
+        go1exp.config.schema.registry.ConfigError: if a plugin that it was trained with is missing.
     """
     container = with_kept_plugins(run, read_as_written(run))
     for settings in _with_files(container.get("actuator")):
@@ -83,7 +89,9 @@ def read_config(run: Path) -> dict[str, Any]:
 def read_parsed(run: Path) -> TrainConfig:
     """Return what ``read_config`` reads, checked.
 
-    Raises FileNotFoundError if ``run`` is no run folder, ConfigError naming the file if its configuration is not known.
+    Raises:
+        FileNotFoundError: if ``run`` is not a run folder.
+        go1exp.config.schema.registry.ConfigError: if this version does not know its configuration; names the file.
     """
     container = read_config(run)
     try:
@@ -95,7 +103,9 @@ def read_parsed(run: Path) -> TrainConfig:
 def read_as_written(run: Path) -> dict[str, Any]:
     """Return the configuration that the run was started with.
 
-    Raises FileNotFoundError if ``run`` is not a run folder, ConfigError if its config.yaml is damaged.
+    Raises:
+        FileNotFoundError: if ``run`` is not a run folder.
+        go1exp.config.schema.registry.ConfigError: if its config.yaml is damaged.
     """
     path = run / "config.yaml"
     if not path.is_file():
@@ -175,7 +185,10 @@ def keep_plugins(run: Path, container: Mapping[str, Any]) -> list[dict[str, obje
     """Copy the files of a configuration's plugins into ``run``; return their records for ``meta.json``.
 
     One that the configuration does not name (of ``GO1EXP_PLUGINS`` or an entry point) counts if a term of it is used.
-    Raises ConfigError if a plugin is missing, OSError if a file cannot be written.
+
+    Raises:
+        ConfigError: if a plugin is missing.
+        OSError: if a file cannot be written.
     """
     named = plugins.names(container.get(plugins.KEY))
     plugins.use(with_kept_plugins(run, container)[plugins.KEY])
@@ -189,7 +202,11 @@ def keep_plugins(run: Path, container: Mapping[str, Any]) -> list[dict[str, obje
 
 
 def with_kept_plugins(run: Path, container: Mapping[str, object]) -> dict[str, Any]:
-    """Return the configuration with the run's copies of its plugins; raise ConfigError if one is not there."""
+    """Return the configuration with the run's copies of its plugins in the place of what it names.
+
+    Raises:
+        ConfigError: if a copy, or a package, is not there.
+    """
     records = _records(run)
     if not records:
         return {**container, plugins.KEY: plugins.names(container.get(plugins.KEY))}

@@ -44,8 +44,11 @@ def locked(run: Path) -> Iterator[None]:
     """Be the only one that trains in ``run``, which is made if it is not there.
 
     A lock of the operating system (``flock``, on NFS as well) ends with the process, however that ends; the file stays.
-    What a killed process left half-written is deleted. Raises RunInUse if another process has it, OSError if the folder
-    cannot be written.
+    What a killed process left half-written is deleted.
+
+    Raises:
+        RunInUse: if another process has it.
+        OSError: if the folder cannot be written.
     """
     try:
         run.mkdir(parents=True, exist_ok=True)
@@ -123,7 +126,11 @@ class RunState:
 
 
 def write(run: Path, state: State, cause: str = "") -> None:
-    """Note the state; ``cause`` is the message of an error. Raise OSError if it cannot be written."""
+    """Note the state; ``cause`` is the message of an error.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
     write_json(run / FILE, asdict(RunState(state, cause)))
 
 

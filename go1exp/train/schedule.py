@@ -41,9 +41,13 @@ class Schedule:
         per_iteration: int = 1,
         iterations: int = 1,
     ) -> None:
-        """Put the first values into force in ``core``, which was built with ``changing`` of the same settings.
+        """Put the first values into force.
 
-        ``per_iteration``: steps of all robots together in one of the ``iterations`` of the whole training.
+        Args:
+            ramps: by name.
+            core: environment, which was built with ``changing`` of the same settings.
+            per_iteration: steps of all robots together in an iteration.
+            iterations: of the whole training.
         """
         self._unit = {"steps": 1, "iterations": per_iteration, "share": per_iteration * iterations}
         self._ramps, self._core = dict(ramps or {}), core
@@ -138,7 +142,11 @@ class Schedule:
 
 
 def check_measures(config: TrainConfig) -> None:
-    """Refuse a ramp that waits for a metric which is not logged: ConfigError naming it and the nearest ones."""
+    """Refuse a ramp that waits for a metric which the training does not log.
+
+    Raises:
+        ConfigError: naming it and the nearest ones.
+    """
     cpu = torch.device("cpu")
     silent = silent_rows(config.task.reward, config.schedule.values())
     known = [name for t in config.task.reward if (name := f"reward/{t.key}") not in silent]

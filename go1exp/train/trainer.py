@@ -146,7 +146,11 @@ def trained_task(config: TrainConfig) -> TaskConfig:
 
 
 def build(config: TrainConfig, group: Group | None = None) -> AdaptivePPO:
-    """Build a ``group`` member's learner, and environment with its share of robots; ConfigError if it has no device."""
+    """Build learner and environment, of a member of ``group`` with its share of the robots.
+
+    Raises:
+        ConfigError: if a device is not there.
+    """
     preflight.check_devices(config)
     if config.process.torch_threads:
         torch.set_num_threads(config.process.torch_threads)

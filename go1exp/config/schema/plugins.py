@@ -156,7 +156,11 @@ def restored() -> Iterator[None]:
 
 
 def installed() -> list[Plugin]:
-    """Import, once, the packages that offer terms by an entry point; return them, or raise ConfigError: a line each."""
+    """Import the packages that offer terms by an entry point, once; return them.
+
+    Raises:
+        ConfigError: one line for each that fails.
+    """
     global _installed
     if _installed is not None:
         return list(_installed.values())

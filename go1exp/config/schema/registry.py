@@ -254,7 +254,11 @@ MORE: list[Callable[[], object]] = []
 
 
 def register(group: str, name: str, **traits: object) -> Callable[[F], F]:
-    """Make the class or function known to ``group`` as ``name``; raise DuplicateError if it has one so named."""
+    """Class or function decorator: make the target known to ``group`` as ``name``.
+
+    Raises:
+        DuplicateError: if the group has a member of that name.
+    """
 
     def decorate(target: F) -> F:
         add(Entry(group, name, target, traits))

@@ -143,7 +143,11 @@ class Trace:
     """(T, N, 4) speed of the fastest touchdown during the step just before its contact, m/s; any value without one."""
 
     def __post_init__(self) -> None:
-        """Check the shapes; raise ValueError naming the column that does not fit."""
+        """Check the shapes.
+
+        Raises:
+            ValueError: naming the column that does not fit.
+        """
         steps, robots = self.counts.shape
         shapes = {"contact": (len(self.contact), robots, robot.NUM_LEGS), "mass": (robots,)}
         if not steps or len(self.contact) % steps:
@@ -178,7 +182,11 @@ class Trace:
         return self.samples * self.contact_dt
 
     def need(self, column: str) -> Array:
-        """Return a column; raise NotMeasured if this trace does not have it."""
+        """Return a column.
+
+        Raises:
+            NotMeasured: if this trace does not have it.
+        """
         values: Array | None = getattr(self, column)
         if values is None:
             raise NotMeasured(f"needs {column}, which was not measured")

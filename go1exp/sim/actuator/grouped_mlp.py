@@ -48,7 +48,10 @@ Piece = tuple[int, int, int]
 def padded_rows(rows: int, counts: Sequence[int], device: torch.device) -> int:
     """Return how many rows to allocate for ``rows`` robots, so that no robot's bits depend on how many there are.
 
-    ``counts``: joints of a robot that each net serves; a net's columns are its joints times the rows.
+    Args:
+        rows: robots, N.
+        counts: joints of a robot that each net serves; a net's columns are its joints times the rows.
+        device: of the buffers.
     """
     threads = torch.get_num_threads() if device.type == "cpu" else 1
     step = max(LANES // math.gcd(LANES, count) for count in counts)

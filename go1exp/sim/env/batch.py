@@ -77,9 +77,16 @@ def _size(state: object) -> int:
 
 
 def refuse_too_many(key: str, value: int, task: TaskConfig, each: int = 1) -> None:
-    """Refuse robots that for certain do not fit into memory: ConfigError naming the setting, and how many would fit.
+    """Refuse robots that for certain do not fit into memory.
 
-    ``value`` of the setting ``key``, times ``each`` robots, do ``task``.
+    Args:
+        key: setting that says how many robots there are.
+        value: its value.
+        task: what they do.
+        each: robots for each of it.
+
+    Raises:
+        go1exp.config.schema.registry.ConfigError: naming the setting, and how many would fit.
     """
     available = free_on(device_of(task.backend))
     one = each * robot_bytes(task, value * each)
@@ -96,7 +103,11 @@ def task_of(overrides: object) -> TaskConfig:
 
 
 def whole(name: str, value: Any, least: int) -> int:
-    """Return a whole number of at least ``least``; raise ConfigError if ``value`` is something else."""
+    """Return a whole number of at least ``least``.
+
+    Raises:
+        ConfigError: if ``value`` is something else.
+    """
     try:
         number = operator.index(value)
     except TypeError:
@@ -107,7 +118,11 @@ def whole(name: str, value: Any, least: int) -> int:
 
 
 def listed(overrides: Any) -> Sequence[str]:
-    """Return overrides as a list; raise ConfigError if they are one text, or one of them is no text."""
+    """Return overrides as a list.
+
+    Raises:
+        ConfigError: if they are one text, or one of them is no text.
+    """
     if isinstance(overrides, str):
         raise ConfigError([f"overrides = {overrides!r}: must be a list of texts, such as [{overrides!r}]"])
     given = list(overrides) if isinstance(overrides, Iterable) else [overrides]

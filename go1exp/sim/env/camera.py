@@ -92,7 +92,9 @@ def choose_gl() -> str:
     """Return the GL library to draw with: the one that MUJOCO_GL names, else the first that works on this machine.
 
     Each is tried in a process of its own (0.6 s), because a failed import would keep PyOpenGL from trying the next.
-    Raises RenderingUnavailable if there is none.
+
+    Raises:
+        RenderingUnavailable: if there is none.
     """
     wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
     if wanted:
@@ -289,10 +291,13 @@ def _close(camera: weakref.ref[Camera]) -> None:
 
 
 def draw_velocities(scene: mujoco.MjvScene, stage: Stage, command: Tensor, velocity: NDArray[np.float64]) -> None:
-    """Add arrows above the robot on ``stage`` to a scene: commanded (blue) and actual (green) velocity.
+    """Add arrows above the robot to a scene: commanded (blue) and actual (green) velocity.
 
-    ``command`` (3,) is x and y in the robot's frame, m/s, and the yaw rate, which is not drawn; ``velocity`` (2,) is in
-    the world's frame, m/s.
+    Args:
+        scene: to add them to.
+        stage: where the robot is.
+        command: (3,) x and y in the robot's frame, m/s; the yaw rate is not drawn.
+        velocity: (2,) in the world's frame, m/s.
     """
     heading = stage.heading()
     cos, sin = math.cos(heading), math.sin(heading)

@@ -20,7 +20,12 @@ T = TypeVar("T")
 
 
 def make_backend(config: BackendConfig, model: Any, sensors: Sensors, num_envs: int) -> PhysicsBackend:
-    """Build the configured physics engine; raise Expected without its packages, ConfigError without its device."""
+    """Build the physics engine that the configuration names.
+
+    Raises:
+        go1exp.config.schema.registry.Expected: if its packages are not installed.
+        go1exp.config.schema.registry.ConfigError: if its device is not there.
+    """
     if isinstance(config, WarpBackend):
         from go1exp.sim.physics.mujoco_warp import MujocoWarp  # its packages are an extra
 
@@ -48,8 +53,12 @@ def free_on(device: torch.device) -> int | None:
 def captured(env: Any, work: Callable[[], T]) -> tuple[Callable[[], None], T]:
     """Record ``work``, which steps ``env`` call by call, as one graph; the runs before that leave no trace in ``env``.
 
-    ``env`` is a ``Go1Core`` whose engine can capture, as ``MujocoWarp`` can. Returns the replay, and what ``work``
-    returned, written anew by each replay.
+    Args:
+        env: a ``Go1Core`` whose engine can capture, as ``MujocoWarp`` can.
+        work: what is recorded.
+
+    Returns:
+        the replay, and what ``work`` returned, written anew by each replay.
     """
     state = env.state_dict()
     recorded: tuple[Callable[[], None], T] = env.backend.capture(work)

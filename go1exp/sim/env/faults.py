@@ -37,7 +37,9 @@ class NumericalFault(Expected):
 def accuse(named: Mapping[str, Tensor], steps: Tensor) -> None:
     """Raise NumericalFault if a value is not finite, about the first such of ``named`` and its first environment.
 
-    ``named`` has values (N, ...) by name, causes before their effects; ``steps`` (N,) since the episode began.
+    Args:
+        named: values (N, ...) by name, causes before their effects.
+        steps: (N,) steps since the episode began.
     """
     for name, values in named.items():
         bad = ~torch.isfinite(values.reshape(len(values), -1)).all(-1)

@@ -108,7 +108,9 @@ class Frames(Memory):
     def ended(self, frame: Tensor, unit: Tensor | None) -> Tensor:
         """Return the observation (N, O) at the end of a step, before any robot begins anew.
 
-        ``frame`` (N, F) has the values of the terms; ``unit`` (N, F) is uniform from -1 to 1, None for no noise.
+        Args:
+            frame: (N, F) values of the terms.
+            unit: (N, F) uniform from -1 to 1; None for no noise.
         """
         if unit is not None:
             if len(self._kept):
@@ -120,8 +122,10 @@ class Frames(Memory):
     def begun(self, frame: Tensor, unit: Tensor | None, anew: Tensor) -> Tensor:
         """Return what the policy sees next (N, O), and keep its frame for later steps.
 
-        ``frame`` and ``unit`` are as for ``ended``; ``anew`` (N,) bool are robots whose episode begins: their earlier
-        frames are all the first one.
+        Args:
+            frame: as for ``ended``.
+            unit: as for ``ended``.
+            anew: (N,) bool, robots whose episode begins: their earlier frames are all the first one.
         """
         rows = anew.unsqueeze(1)
         if unit is not None:

@@ -86,7 +86,11 @@ class Check:
 
 
 def require(reference: PhysicsBackend, engine: PhysicsBackend, name: str) -> list[Check]:
-    """Return the checks of an engine that agrees with the reference; else raise Expected with all that differs."""
+    """Return the checks of an engine that agrees with the reference.
+
+    Raises:
+        Expected: if it does not, with everything that differs in one line.
+    """
     checks = compare(reference, engine)
     if failed := [str(check) for check in checks if not check.holds]:
         raise Expected(

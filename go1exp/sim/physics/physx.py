@@ -63,7 +63,11 @@ class PhysxCpu(MujocoCpu):
     """N robots, each in a PhysX system of its own (see ``PhysicsBackend``)."""
 
     def __init__(self, model: mujoco.MjModel, sensors: Sensors, num_envs: int, settings: PhysxBackend) -> None:
-        """Build the robots on ``settings.threads``, 0 for all cores; raise Expected for a part not translated."""
+        """Build the robots; ``settings.threads`` = 0 takes all cores.
+
+        Raises:
+            go1exp.config.schema.registry.Expected: if the model has a part that is not translated to PhysX.
+        """
         kinematics = copy.copy(model)
         kinematics.opt.disableflags |= int(NO_DYNAMICS)
         super().__init__(kinematics, sensors, num_envs, settings.threads)
@@ -87,7 +91,11 @@ class PhysxCpu(MujocoCpu):
     # ------------------------------------------------------------------ the model
 
     def field(self, name: str) -> Tensor:
-        """Live per-environment values of a model field; raise ConfigError if PhysX cannot give robots their own."""
+        """Live per-environment values of a model field.
+
+        Raises:
+            ConfigError: if PhysX cannot give robots their own.
+        """
         if name not in (*APPLIED, *BY_MUJOCO, *DERIVED, *self._fields):
             raise ConfigError([f"engine = physx: robots cannot differ in {name}: {RIGID.get(name, 'not supported')}"])
         live = super().field(name)

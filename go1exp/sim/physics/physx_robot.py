@@ -63,7 +63,9 @@ def ground_shape(model: mujoco.MjModel, settings: PhysxBackend) -> physx.PhysxCo
     """Return the ground as one shape that all robots' systems share: a plane, or a height field's triangles.
 
     A cell of the field is split along the diagonal along which MuJoCo splits it (``go1exp.sim.terrain.Terrain``).
-    Raises Expected if the floor is something else.
+
+    Raises:
+        Expected: if the floor is something else.
     """
     floor, smooth = model.geom(FLOOR), physx.PhysxMaterial(0.0, 0.0, 0.0)
     if floor.type == mujoco.mjtGeom.mjGEOM_PLANE:
@@ -111,7 +113,11 @@ class PhysxRobot:
     """
 
     def __init__(self, model: mujoco.MjModel, settings: PhysxBackend, ground: physx.PhysxCollisionShape) -> None:
-        """Build it; raise Expected if the model has joints or shapes other than a Go1's."""
+        """Build it.
+
+        Raises:
+            Expected: if the model has joints or shapes other than a Go1's.
+        """
         self._model, self._settings = model, settings
         self.shapes = {ground: model.geom(FLOOR).id}
         physx.set_scene_config(gravity=model.opt.gravity, enable_tgs=settings.solver == "tgs")
@@ -267,7 +273,10 @@ def dry_friction(bound: float) -> tuple[float, float]:
 def pair_friction(model: mujoco.MjModel, geom: int, friction: np.ndarray) -> np.ndarray:
     """Return a geom's sliding friction with the ground by MuJoCo's rule: the higher priority's, else the larger.
 
-    ``friction``: ``geom_friction`` of any number of robots (..., geoms, 3); the answer has the shape (...).
+    Args:
+        model: whose priorities count.
+        geom: the geom.
+        friction: ``geom_friction`` of any number of robots (..., geoms, 3); the answer has the shape (...).
     """
     floor = model.geom(FLOOR).id
     first, second = model.geom_priority[geom], model.geom_priority[floor]

@@ -157,8 +157,10 @@ def _shaped(inertia: str, touches: bool, decoration: bool) -> mujoco.MjSpec:
 def add_mount(trunk: mujoco.MjsBody) -> None:
     """Let a held trunk move: three slides and two hinges, none of which has a spring or a damper yet.
 
-    The slides are along the axes of the world, the hinges about those of ``trunk``: a child of the world, with its
-    attitude set and without joints.
+    The slides are along the axes of the world, the hinges about those of the trunk.
+
+    Args:
+        trunk: body of the trunk, a child of the world, with its attitude set and without joints.
     """
     back = Rotation.from_quat(trunk.quat, scalar_first=True).inv().as_matrix()
     slides = [(name, mujoco.mjtJoint.mjJNT_SLIDE, back[:, k]) for k, name in enumerate(MOUNT_SLIDES)]

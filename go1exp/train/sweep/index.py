@@ -65,7 +65,11 @@ class Index:
 
 
 def read(folder: Path) -> Index:
-    """Return a sweep's index, with the states that its run folders have now; raise Expected without a whole index."""
+    """Return a sweep's index, with the states that its run folders have now.
+
+    Raises:
+        Expected: if ``folder`` is no sweep folder, or its index is damaged.
+    """
     try:
         content = json.loads((folder / FILE).read_text())
         if content["format"] != FORMAT:
@@ -80,14 +84,21 @@ def read(folder: Path) -> Index:
 
 
 def write(folder: Path, index: Index) -> None:
-    """Write a sweep's index, whole or not at all; raise OSError if it cannot be written: the older file stays."""
+    """Write a sweep's index, whole or not at all.
+
+    Raises:
+        OSError: if it cannot be written; the older file stays.
+    """
     write_json(folder / FILE, asdict(index))
 
 
 def looked_at(index: Index, folder: Path, causes: Mapping[str, str] | None = None) -> Index:
     """Return the index with the states that the run folders have now.
 
-    ``causes``: run folder -> what a job said last, for those whose folder could not take it (a full disk).
+    Args:
+        index: with older states.
+        folder: of the sweep.
+        causes: run folder -> what a job said last, for those whose folder could not take it (a full disk).
     """
     return replace(index, jobs=tuple(_now(job, folder, (causes or {}).get(job.run_folder, "")) for job in index.jobs))
 

@@ -50,10 +50,15 @@ def alive(folder: Path) -> Iterator[str]:
 
 
 def sampler(seed: int, number: int, parallel: bool) -> optuna.samplers.TPESampler:
-    """Return what draws the settings of one trial; ``parallel``: others run meanwhile, it does not draw close to them.
+    """Return what draws the settings of one trial.
 
     A sampler that lived as long as its process would draw the same again in every process that goes on, and on every
     machine that joins. The number of a trial is its own on all of them.
+
+    Args:
+        seed: of the search.
+        number: of the trial.
+        parallel: other trials run meanwhile; do not draw close to them.
     """
     import numpy as np
     import optuna
@@ -70,7 +75,12 @@ def put_back(study: optuna.Study, folder: Path, patience: float = PATIENCE_S) ->
     """Put the trials of searches that were killed in front, so that they go on in their run folders.
 
     Returns whether some stay as they are: their trainings still ran after ``patience``, or it is unknown yet whose they
-    are. ``patience`` is the longest wait for trainings to end, s, for all of them together.
+    are.
+
+    Args:
+        study: Optuna's.
+        folder: of the trials.
+        patience: longest wait for trainings to end, s, for all of them together.
     """
     from optuna.trial import TrialState
 
@@ -98,10 +108,15 @@ def put_back(study: optuna.Study, folder: Path, patience: float = PATIENCE_S) ->
 
 
 def go_on(study: optuna.Study, trial: BaseTrial, run: str) -> None:
-    """Put in front the trial that goes on with a stopped one of run folder ``run``, unless that is done already.
+    """Put in front the trial that goes on with a stopped one, unless that is done already.
 
     To be called before the stopped one counts as failed: a search that is killed between the two has its trial still
     running, and ``put_back`` finds it. Two searches may do so at once; see ``is_superfluous``.
+
+    Args:
+        study: Optuna's.
+        trial: the stopped one.
+        run: name of its run folder.
     """
     if not _continuations(study, trial.number):
         stored = study.get_trials(deepcopy=False)[trial.number]

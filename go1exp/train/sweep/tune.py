@@ -106,7 +106,13 @@ class Search:
     def __init__(
         self, settings: TuneSettings, ranges: dict[str, Range], plan: Callable[[Sequence[str], Path], None]
     ) -> None:
-        """Prepare it; ``plan(overrides, run folder)`` makes the folder of a trial and raises ConfigError."""
+        """Prepare it.
+
+        Args:
+            settings: of the search.
+            ranges: key of a setting -> what it is drawn from.
+            plan: ``(overrides, run folder)``, makes the folder of a trial; raises ConfigError.
+        """
         self.settings, self.ranges, self.plan = settings, ranges, plan
         self.folder = Path(settings.out).absolute()
         self._lock = threading.Lock()
