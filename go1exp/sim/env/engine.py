@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -50,12 +50,24 @@ def free_on(device: torch.device) -> int | None:
     return int(torch.cuda.mem_get_info(device)[0]) if torch.cuda.is_available() else None
 
 
-def captured(env: Any, work: Callable[[], T]) -> tuple[Callable[[], None], T]:
-    """Record ``work``, which steps ``env`` call by call, as one graph; the runs before that leave no trace in ``env``.
+class Steps(Protocol):
+    """An environment whose step may be part of a graph."""
 
-    Args:
-        env: a ``Go1Core`` whose engine can capture, as ``MujocoWarp`` can.
-        work: what is recorded.
+    backend: Any
+    """With ``capture``, as ``MujocoWarp`` has it."""
+
+    def step_by_call(self, action: Tensor) -> StepResult:
+        """Step."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that steps change."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Put it back."""
+
+
+def captured(env: Steps, work: Callable[[], T]) -> tuple[Callable[[], None], T]:
+    """Record ``work``, which steps ``env`` call by call, as one graph; the runs before that leave no trace in ``env``.
 
     Returns:
         the replay, and what ``work`` returned, written anew by each replay.
@@ -69,7 +81,7 @@ def captured(env: Any, work: Callable[[], T]) -> tuple[Callable[[], None], T]:
 class CapturedStep:
     """The step of an environment as one graph."""
 
-    def __init__(self, env: Any, action: Tensor) -> None:
+    def __init__(self, env: Steps, action: Tensor) -> None:
         """Record it for actions (N, A) like this one."""
         self._action = torch.zeros_like(action)
         self._replay, self._result = captured(env, lambda: env.step_by_call(self._action))
