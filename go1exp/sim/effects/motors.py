@@ -89,8 +89,8 @@ class TorqueSpeedLimit(Effect):
 
     ``droop`` = 0 is a supply without limit: no line. At 1 torque ends at V, at 1.25 already at 0.8 V, as with a battery
     that is down by a fifth (and ``peak`` 0.8). ``stall`` = 1 lets torque fall from rest on, as Isaac Lab and mjlab have
-    it for the Go1; the 30 N m at rest that the authors of walk-these-ways report make it 1.27. There is no published a
-    measured line. A small ``droop`` does nothing until a motion reaches the line: big fast steps show it, walking does
+    it for the Go1; the 30 N m at rest that the authors of walk-these-ways report make it 1.27. No measured line is
+    published. A small ``droop`` does nothing until a motion reaches the line: big fast steps show it, walking does
     not. It comes last in the actuator, so that ``strength`` shrinks what it limits.
 
     With ``peak`` 1 and ``droop`` 0 torques pass as they are, without a limit beyond the actuator's and the model's own.
