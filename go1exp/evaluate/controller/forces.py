@@ -15,12 +15,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from go1exp.base.errors import Expected
-from go1exp.evaluate.controller.settings import ForceSettings
 from go1exp.robot import GRAVITY
+
+if TYPE_CHECKING:
+    from go1exp.evaluate.controller.settings import ForceSettings
 
 
 class SolverError(Expected):

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from torch import Tensor
 
 from go1exp import robot
 from go1exp.evaluate.protocol.plan import Array, Motion
 from go1exp.evaluate.quantities import FINGERPRINT, Row
 from go1exp.mdp.measures.trace import mean_over
-from go1exp.mdp.types import Snapshot
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from go1exp.mdp.types import Snapshot
 
 SAMPLE = 0.1  # time between two samples of the metrics, s
 POWER, TORQUE = 100.0, 30.0  # root mean squares over joints that score 0: of power, W, and of torque changes, N m
