@@ -50,7 +50,8 @@ def gl() -> str:
 
 @pytest.fixture
 def core(start_core: MakeCore) -> Go1Core:
-    return start_core(*PLAIN, num_envs=2)
+    core = start_core(*PLAIN, num_envs=2)
+    return core
 
 
 @pytest.fixture

@@ -26,14 +26,13 @@ from mujoco.batch import Batch
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from go1exp import robot
-from go1exp.config.compose import compose
 from go1exp.config.schema.joint_values import spread
 from go1exp.sim.env.batch import MANY as MANY_ROBOTS
 from go1exp.sim.env.batch import robot_bytes
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.gym_env import Go1Env
 from go1exp.sim.physics.scene import build_model
-from go1exp.sim.task import TaskConfig, TrainConfig, parse_task
+from go1exp.sim.task import TaskConfig, TrainConfig
 from go1exp.sim.terrain import build_terrain
 from go1exp.train import trainer
 from go1exp.train.network import policy_settings
@@ -166,6 +165,9 @@ def resident_kb_after_steps(num_envs: int, overrides: list[str]) -> int:
 
     From Linux's own account where there is one: ``getrusage`` counts the memory of the process that started this one.
     """
+    from go1exp.config.compose import compose
+    from go1exp.sim.task import parse_task
+
     work = core_subject(parse_task(compose("train", overrides)), num_envs)
     for _ in range(3):
         work()

@@ -28,6 +28,7 @@ class Mailbox:
     def __init__(self, pipe: Connection) -> None:
         self._pipe, self._free = pipe, True
         self.waiting: dict[type[messages.Snapshot], messages.Snapshot] = {}
+        self._came: list[messages.Event] = []
         self.newest: dict[type[messages.Snapshot], messages.Snapshot] = {}
         self.over = False
         self.events, self.snapshots = _Events(self), _Snapshots(self)
@@ -48,12 +49,11 @@ class Mailbox:
 
     def new_events(self) -> list[messages.Event]:
         """Take in all that has come, and return its events; an end of Studio where the other end has gone."""
-        came: list[messages.Event] = []
         try:
             while self._pipe.poll():
                 kind, load = self._pipe.recv()
                 if kind == "event":
-                    came.append(load)
+                    self._came.append(load)
                 elif kind == "snapshots":
                     self.newest |= {type(snapshot): snapshot for snapshot in load}
                     self.send("taken")
@@ -63,8 +63,9 @@ class Mailbox:
             self.over = True
         self.pass_on()
         if self.over:
-            came.append(messages.ExitEvent())
-        return came
+            self._came.append(messages.ExitEvent())
+        events, self._came = self._came, []
+        return events
 
     def close(self) -> None:
         """Close this end."""

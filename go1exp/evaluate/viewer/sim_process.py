@@ -15,7 +15,6 @@ from multiprocessing.connection import Connection
 from queue import SimpleQueue
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from go1exp import robot
@@ -23,14 +22,13 @@ from go1exp.base.errors import REFUSED, Expected
 from go1exp.base.signals import ending
 from go1exp.config.schema.registry import ConfigError
 from go1exp.deploy.sim_robot import SimConfig
-from go1exp.deploy.sim_robot.alone import Say, posture, serve
+from go1exp.deploy.sim_robot.alone import Say, posture
 from go1exp.deploy.sim_robot.machine import TICK, Body, Robot
 from go1exp.deploy.sim_robot.server import GONE_S, Server
 from go1exp.evaluate.protocol.plan import Kicker, heading
 from go1exp.evaluate.viewer import requests as ask
 from go1exp.evaluate.viewer.requests import active, catalogue
 from go1exp.evaluate.viewer.session import PushMade, one_push
-from go1exp.sim.task import required_parts
 
 Array = NDArray[np.float64]
 EVERY = 5  # ticks from row to row
@@ -268,6 +266,11 @@ def _run(
     say: Say,
 ) -> None:
     """Run the robot until the page's end of the pipe is closed."""
+    import torch
+
+    from go1exp.deploy.sim_robot.alone import serve
+    from go1exp.sim.task import required_parts
+
     torch.set_num_threads(1)
     sys.setswitchinterval(SWITCH_S)
     try:
