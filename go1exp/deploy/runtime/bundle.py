@@ -277,7 +277,7 @@ def _trace(content: bytes, metadata: Metadata, source: str) -> dict[str, np.ndar
     except Exception as error:  # damage of a zip and of the arrays in it has many forms
         raise BundleError(f"{source}: {TRACE}: not NumPy's arrays ({error})") from None
     ports = {"input": metadata.inputs, "output": metadata.outputs}
-    sizes = {f"{kind}.{port.name}": port.size for kind, some in ports.items() for port in some}
+    sizes = {f"{kind}.{port.name}": port.size for kind, group in ports.items() for port in group}
     if arrays.keys() != {"time", *sizes}:
         odd = ", ".join(sorted(arrays.keys() ^ {"time", *sizes}))
         raise BundleError(f"{source}: {TRACE}: arrays missing or too many: {odd}")

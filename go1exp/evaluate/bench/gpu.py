@@ -9,8 +9,8 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from typing import Any
 
-import mujoco
 import torch
 
 from go1exp import robot
@@ -61,12 +61,10 @@ def stepped(step: Callable[[torch.Tensor], object], num_envs: int) -> Subject:
     return work
 
 
-def bare_subject(
-    task: TaskConfig, num_envs: int, change: Callable[[mujoco.MjModel], object] = lambda model: None
-) -> Subject:
+def bare_subject(task: TaskConfig, num_envs: int, change: Callable[[Any], object] = lambda model: None) -> Subject:
     """MuJoCo Warp alone, as one graph: the same model with its sensors, a PD torque once a policy step, no MDP.
 
-    ``change`` may set options of the model.
+    ``change`` may set options of the compiled ``mujoco.MjModel``.
     """
     terrain = build_terrain(task.terrain)
     model, sensors = build_model(task.robot, terrain, task.sim.physics_dt, contact=task.contact)

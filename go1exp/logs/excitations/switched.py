@@ -67,9 +67,9 @@ def steps(
 
     while now <= duration:
         end = now + rng.uniform(*mixed)
-        for joint, own in enumerate(edges):
-            own += _ordinary(rng, now, end, small[0][joint], small[1][joint], hold)
-            own.append((end, float(centre[joint])))
+        for joint, jumps in enumerate(edges):
+            jumps += _ordinary(rng, now, end, small[0][joint], small[1][joint], hold)
+            jumps.append((end, float(centre[joint])))
         now = end + rng.uniform(*turn)
         group, side = next(turns), rng.choice((-1.0, 1.0))
         for sign in (side, -side):
@@ -78,8 +78,8 @@ def steps(
         jump(group, centre)
         now += rng.uniform(*turn)
     target = np.empty((len(t), joints))
-    for joint, own in enumerate(edges):
-        times, levels = np.array(own).T
+    for joint, jumps in enumerate(edges):
+        times, levels = np.array(jumps).T
         target[:, joint] = levels[np.searchsorted(times, t - t[0], side="right") - 1]
     return always_on(np.clip(target, limits[:, 0], limits[:, 1]), "suspended")
 
