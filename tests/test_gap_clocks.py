@@ -94,6 +94,7 @@ def taken(recordings: list[Recording]) -> ClockChoice:
     return choice
 
 
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 def test_of_stretched_times_those_of_the_speeds_are_taken(motions: list[tuple[np.ndarray, ...]]) -> None:
     choice = taken(logs(motions, stretched=1.1))
     assert (choice.taken, choice.decided, choice.reason) == ("speeds", True, "")

@@ -246,6 +246,7 @@ def search_in(recordings: tuple[Recording, ...], config: RobotConfig, contact: C
     return begun(score, parts, QUICK, 0.001, rng)
 
 
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 def test_a_hard_floor_is_the_models_own_where_recordings_name_it_and_else_off() -> None:
     config, recordings = recorded("excitation=[squat,drop]", "contact=stiff", "seeds=[0,1]")
     own, other = (search_in(recordings, config, contact) for contact in (None, MUJOCO_CONTACT))

@@ -90,6 +90,7 @@ def answer(folder: Path, effects: Mapping[str, Mapping[str, Any]]) -> GapResult:
     return explain(recorded(robot, effects), robot, SETTINGS)
 
 
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 def test_a_leg_without_a_secret_has_no_gap(tmp_path: Path) -> None:
     result = answer(tmp_path, {})
     assert result.verdict == "no gap"

@@ -428,6 +428,7 @@ def test_friction_of_loaded_gears_is_told_from_dry_friction_and_by_its_law(exter
     assert ("external 1" in result.sentence) == (external == 1.0)
 
 
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 @pytest.mark.usefixtures("few")
 def test_a_value_that_is_held_has_no_interval() -> None:
     """The law of a loaded gear's friction is chosen and held; only the coefficient is fitted, and uncertain."""

@@ -120,6 +120,7 @@ def test_legs_in_the_air_follow_the_free_robot_and_not_without_the_motion_of_its
     assert np.median(unexplained(dataclasses.replace(comparison, scorer=scorer))) > 10 * np.median(right)
 
 
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 def test_an_imu_that_sits_tilted_is_turned_back() -> None:
     config, recordings = recorded("+effect.base_tilt.pitch=0.1", "+effect.base_tilt.roll=-0.06", *EXACT)
     comparison = compare(recordings, SuspendedGo1(config), SWING, physics_dt=0.0005)
