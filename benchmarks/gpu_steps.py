@@ -1,9 +1,9 @@
 """What options of the physics are worth on a GPU, and which errors they make: ``python -m benchmarks.gpu_steps``.
 
-Each row changes one option of ``experiment=clock backend=warp`` (robots on flat ground, a PD law, random targets):
+Rows change options of ``experiment=clock backend=warp`` (robots on flat ground, a PD law, random targets):
 
-- ``steps_per_s``: policy steps of bare MuJoCo Warp, one CUDA graph each; ``over_plain``: over the unchanged model's of
-  the same round, median over rounds.
+- ``steps/s``: policy steps of bare MuJoCo Warp, one CUDA graph each; ``over plain``: over the unchanged model's of the
+  same round, median over rounds.
 - ``angle_mrad``, ``height_mm``: what joint angles and the trunk's height are off after 0.1 s, root mean square over
   joints, median over robots that start from the same states under the same targets; ``p90``: their 90th percentile.
   The reference is MuJoCo in double precision with steps of 0.25 ms and no option changed.
@@ -124,9 +124,8 @@ def main(arguments: Sequence[str]) -> None:
     measured = rates({name: bare_subject(tasks[name], num_envs, change) for name, (change, _) in ROWS.items()}, much)
     print(f"{gpu()}; {num_envs} robots")
     speed = speeds(measured)
-    print(
-        f"{'':36s}{'steps/s':>10s}{'over plain':>12s}" + "".join(f"{name:>16s}" for name in next(iter(found.values())))
-    )
+    names = "".join(f"{name:>16s}" for name in found["plain"])
+    print(f"{'':36s}{'steps/s':>10s}{'over plain':>12s}{names}")
     for name, off in found.items():
         figures = f"{speed[f'{name}_steps_per_s']:10,.0f}{ratio(measured, name, 'plain'):12.2f}"
         print(f"{name:36s}{figures}" + "".join(f"{value:16.2f}" for value in off.values()))

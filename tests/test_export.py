@@ -447,6 +447,8 @@ def test_a_trace_is_never_unpickled(good: Bundle, members: dict[str, bytes]) -> 
         ({"action_scale": "0.3"}, "action_scale = '0.3': must be a finite number"),
         ({"action_scale": True}, "action_scale = True: must be a finite number"),
         ({"action_clip": 1e-4}, "action_clip is not that of the trace"),
+        ({"action_max_step": 1e-4}, "action_max_step is not that of the trace"),
+        ({"action_max_step": 0}, "action_max_step: must be greater than 0"),
         ({"nominal_stance": [0.0] * 12}, "nominal_stance and action_scale are not those of the trace"),
         ({"policy_dt": 0}, "policy_dt: must be greater than 0"),
         ({"observation": []}, "outputs: their sizes are"),

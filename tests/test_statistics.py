@@ -156,6 +156,7 @@ def test_the_mean_has_student_s_interval() -> None:
 
 
 def test_the_share_has_wilson_s_interval() -> None:
+    assert share_interval(0, 600).low == 0.0
     assert share_interval(0, 600).high == pytest.approx(1.959964**2 / (600 + 1.959964**2), rel=1e-5)
     assert share_interval(13, 500).low == pytest.approx(0.01526, abs=1e-4)
     assert share_interval(0, 0).n == 0

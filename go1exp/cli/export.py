@@ -151,12 +151,15 @@ def summary(bundle: Bundle) -> list[tuple[str, str]]:
     commit = f"{run.get('git') or 'unknown'}{' (with changes)' if run.get('git_dirty') else ''}"
     ranges = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in about.command_ranges.items())
     packages = ", ".join(f"{name} {version}" for name, version in versions.get("packages", {}).items())
+    limits = f"cut at +-{about.action_clip:g}"
+    if about.action_max_step is not None:
+        limits += f", the target changed by at most {about.action_max_step:g} rad"
     return [
         ("file", f"{bundle.source}, SHA-256 {bundle.seal}"),
         ("robot", about.robot),
         ("trained", f"{about.trained.num_timesteps / 1e6:.2f} M steps, {about.trained.checkpoint}, commit {commit}"),
         ("rates", f"policy {1 / about.policy_dt:g} Hz, actuators {1 / about.physics_dt:g} Hz (in training)"),
-        ("action", f"target = nominal stance + {about.action_scale:g} rad x action, cut at +-{about.action_clip:g}"),
+        ("action", f"target = nominal stance + {about.action_scale:g} rad x action, {limits}"),
         ("commands", ranges or "unknown"),
         ("estimator", estimator(about.estimator)),
         ("exported by", f"go1exp {versions.get('go1exp')}, Python {versions.get('python')}, {packages}"),

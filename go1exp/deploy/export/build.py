@@ -187,6 +187,7 @@ def metadata(task: TaskConfig, inputs: tuple[Port, ...], trained: Trained) -> Me
             conventions=CONVENTIONS,
             estimator=json.loads(to_json(go1())),
             trained=trained,
+            action_max_step=task.action.max_step,
         )
     except ValueError as error:
         raise ExportError(str(error)) from None

@@ -247,6 +247,10 @@ def _check_action(trace: Mapping[str, np.ndarray], metadata: Metadata, source: s
         raise BundleError(f"{source}: {METADATA}: nominal_stance and action_scale are not those of the trace")
     if not float(np.max(np.abs(action))) <= metadata.action_clip + TOLERANCE:
         raise BundleError(f"{source}: {METADATA}: action_clip is not that of the trace")
+    if metadata.action_max_step is not None:
+        change = metadata.action_scale * (action - trace.get("input.previous_action", np.inf))
+        if not float(np.max(np.abs(change))) <= metadata.action_max_step + TOLERANCE:
+            raise BundleError(f"{source}: {METADATA}: action_max_step is not that of the trace")
 
 
 def _json(content: bytes, where: str) -> dict[str, Any]:

@@ -70,7 +70,11 @@ class Ring:
 
     def part(self, name: str) -> np.ndarray:
         """Return a part of all rows that are kept, (T, width), or (T,) if its width is 1."""
-        values = self.rows()[:, self.columns[name]]
+        return self.part_of(self.rows(), name)
+
+    def part_of(self, rows: np.ndarray, name: str) -> np.ndarray:
+        """Return a part of ``rows`` (T, ...), as ``part`` does of those that are kept."""
+        values = rows[:, self.columns[name]]
         return values[:, 0] if values.shape[1] == 1 else values
 
 
@@ -204,7 +208,8 @@ class Log:
 
         An overtaken state counts as having arrived with the first of those that overtook it.
         """
-        clock, part = self.states.part("clock"), self.states.part(name)
+        rows = self.states.rows()  # once: a ring that is full is copied
+        clock, part = self.states.part_of(rows, "clock"), self.states.part_of(rows, name)
         if np.isnan(clock).any() or (np.diff(clock) >= 0.0).all():
             return part
         part = part[np.argsort(clock, kind="stable")]

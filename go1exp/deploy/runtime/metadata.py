@@ -82,6 +82,7 @@ class Metadata:
         conventions: description of frames, quaternions and signs.
         estimator: settings of the state estimator (``deploy.estimation.FilterConfig`` as JSON); empty: those of a Go1.
         trained: the policy's origin.
+        action_max_step: largest change of a target from ``previous_action``'s, rad; None for any.
     """
 
     robot: str
@@ -104,6 +105,7 @@ class Metadata:
     conventions: dict[str, str]
     estimator: dict[str, Any]
     trained: Trained
+    action_max_step: float | None = None  # bundles of older versions have none
 
     def __post_init__(self) -> None:
         """Check relations between values; raise ValueError with the name of one of them."""
@@ -126,8 +128,8 @@ class Metadata:
         earlier = sum(block.size - block.size // block.history for block in self.observation)
         if earlier != sum(port.size for port in self.inputs if port.name == "past"):
             raise ValueError(f"inputs: past must have the {earlier} numbers of the observation's earlier frames")
-        for name in ("action_scale", "action_clip", "policy_dt", "physics_dt"):
-            if not getattr(self, name) > 0:
+        for name in ("action_scale", "action_clip", "action_max_step", "policy_dt", "physics_dt"):
+            if (value := getattr(self, name)) is not None and not value > 0:
                 raise ValueError(f"{name}: must be greater than 0")
         self._check_joints()
         for name, (low, high) in self.command_ranges.items():

@@ -82,8 +82,15 @@ def _inside(x: Field, course: float) -> Field:
 
 
 SHAPES: dict[str, Shape] = {
-    **{"slope_up": _slope, "slope_down": _slope, "stairs_up": _stairs, "stairs_down": _stairs, "gravel": _gravel},
-    **{"waves": _waves, "crossed_waves": _crossed_waves, "boxes": _boxes, "obstacles": _obstacles},
+    "slope_up": _slope,
+    "slope_down": _slope,
+    "gravel": _gravel,
+    "waves": _waves,
+    "crossed_waves": _crossed_waves,
+    "stairs_up": _stairs,
+    "stairs_down": _stairs,
+    "boxes": _boxes,
+    "obstacles": _obstacles,
 }
 """Height of a lane at x (1, n) after the run-up and y (m, 1): (m, n), or (1, n) whatever y is; or depth."""
 
