@@ -59,7 +59,7 @@ ROWS: Mapping[str, tuple[Change, tuple[str, ...]]] = {
     "sparse Jacobian": (option(jacobian=int(mujoco.mjtJacobian.mjJAC_SPARSE)), ()),
     "dense Jacobian": (option(jacobian=int(mujoco.mjtJacobian.mjJAC_DENSE)), ()),
     "implicitfast": (option(integrator=int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)), ()),
-    "24 contacts, 96 rows": (option(), ("backend.nconmax=24", "backend.njmax=96")),
+    "32 contacts, 96 rows": (option(), ("backend.nconmax=32", "backend.njmax=96")),
     "steps of 4 ms": (option(), ("sim.physics_dt=0.004",)),
     "steps of 5 ms": (option(), ("sim.physics_dt=0.005",)),
     "4 ms, iterations 4, line search 10": (option(iterations=4, ls_iterations=10), ("sim.physics_dt=0.004",)),
@@ -121,7 +121,9 @@ def main(arguments: Sequence[str]) -> None:
     found = {name: errors(moved(tasks[name], robots, change) - reference) for name, (change, _) in ROWS.items()}
     seconds = float(given.get("seconds", 3.0))
     much = Measured(num_envs, int(given.get("rounds", 3)), seconds, lambda done, total: print(f"round {done}/{total}"))
-    measured = rates({name: bare_subject(tasks[name], num_envs, change) for name, (change, _) in ROWS.items()}, much)
+    subjects = {name: bare_subject(tasks[name], num_envs, change) for name, (change, _) in ROWS.items()}
+    print("errors found, graphs captured", flush=True)
+    measured = rates(subjects, much)
     print(f"{gpu()}; {num_envs} robots")
     speed = speeds(measured)
     names = "".join(f"{name:>16s}" for name in found["plain"])

@@ -178,6 +178,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("train word", ("word: not a setting, which is key=value; see go1exp train --help",)),
         ("train -m seed=1,2 ppo.gama=2", ("ppo.gama=2: no such key 'ppo.gama'; did you mean 'ppo.gamma'",)),
         ("train hydra.run.dir=x reward.foot_slp.weight=2", ("reward.foot_slp.weight=2: no such key",)),
+        ("train rand.foot_friction.range.low=1", ("no such key 'rand.foot_friction.range.low'; did you mean",)),
+        ("train rand.foot_friction.range.5=1", ("no such key 'rand.foot_friction.range.5'; did you mean",)),
         ("train reward.foot_slip={wieght:1}", ("no such key 'reward.foot_slip.wieght'; did you mean",)),
         ("train -m +seed=1", ("+seed=1: 'seed' exists already; leave out the plus: 'seed=1'",)),
         ("train -m --cfg job seed=1,2", ("-m and --cfg cannot be used together: --cfg and --info show",)),

@@ -214,7 +214,7 @@ def test_at_another_rate_the_previous_action_is_the_mean_over_a_training_period(
 
 
 @pytest.mark.parametrize(("policy_dt", "cycles"), [(None, 1), (0.01, 2), (0.004, 5)])
-def test_the_step_of_a_target_is_bounded_from_the_previous_action_at_any_rate(
+def test_a_target_changes_by_no_more_than_the_bound_in_a_training_period_at_any_rate(
     task: TaskConfig, policy_dt: float | None, cycles: int
 ) -> None:
     where, observed = columns(task, "previous_action"), []
@@ -227,7 +227,7 @@ def test_the_step_of_a_target_is_bounded_from_the_previous_action_at_any_rate(
     evaluate(task, policy, settings(seconds=0.2, settle_s=0.0, policy_dt=policy_dt))
     actions, means = [0.0] * cycles, [0.0]
     for _ in observed:
-        actions.append(min(0.25, means[-1] + 0.1))
+        actions.append(min(0.25, actions[-cycles] + 0.1))
         means.append(sum(actions[-cycles:]) / cycles)
     assert observed == pytest.approx(means[: len(observed)], abs=1e-6)
 

@@ -342,13 +342,17 @@ def _culprit(verb: str, overrides: Sequence[str], folders: tuple[Path, ...]) -> 
     for o in values:
         if o.package or o.is_sweep_override() or o.key_or_group.startswith("hydra."):  # Hydra's own, not in ``config``
             continue
-        exists = OmegaConf.select(config, o.key_or_group, throw_on_missing=False) is not None
+        exists = False
+        with suppress(OmegaConfBaseException):  # a word as the index of a list
+            exists = OmegaConf.select(config, o.key_or_group, throw_on_missing=False) is not None
         try:
             ConfigLoaderImpl._apply_overrides_to_config([o], config)
         except REFUSED as error:
             if o.is_add() and exists:
                 return Refusal("present", o.key_or_group)
-            if (o.is_delete() and not exists) or isinstance(error.__cause__, AttributeError | KeyError):
+            no_index = not isinstance(error, HydraException | OmegaConfBaseException)
+            missing = isinstance(error.__cause__, AttributeError | KeyError | IndexError)
+            if no_index or missing or (o.is_delete() and not exists):
                 return Refusal("key", getattr(error.__cause__ if exists else None, "full_key", None) or o.key_or_group)
             return None
     return None

@@ -131,7 +131,7 @@ class Past(Generic[A]):
 
 
 class PolicyMemory:
-    """Runs a policy and keeps its inputs ``previous_action`` and ``past`` for the next cycle.
+    """Runs a policy and keeps its inputs ``previous_action``, ``earlier_action`` and ``past`` for the next cycle.
 
     Attributes:
         values: those of these inputs that the policy has, by name, float32 (rows, size).
@@ -141,10 +141,13 @@ class PolicyMemory:
         """Start an episode of ``rows`` robots; ``period`` is the present one of the policy, s."""
         sizes = {port.name: port.size for port in about.inputs}
         self.values: dict[str, np.ndarray] = {
-            name: np.zeros((rows, sizes[name]), np.float32) for name in ("previous_action", "past") if name in sizes
+            name: np.zeros((rows, sizes[name]), np.float32)
+            for name in ("previous_action", "earlier_action", "past")
+            if name in sizes
         }
         self._columns = columns_of((block.size // block.history, block.history) for block in about.observation)
         self._actions = Past[np.ndarray](about.policy_dt, period)
+        self._bounding = Past[np.ndarray](about.policy_dt, period)
         self._frames = Past[np.ndarray](about.policy_dt, period)
         self._first: np.ndarray | None = None
 
@@ -159,6 +162,8 @@ class PolicyMemory:
         outputs = policy(readings)
         if "previous_action" in self.values:
             self.values["previous_action"] = self._actions.mean(outputs["action"])
+        if "earlier_action" in self.values:
+            self.values["earlier_action"] = self._bounding.after(outputs["action"], self.values["earlier_action"])
         if self._first is not None:
             self.values["past"] = self._frames.after(outputs["observation"][:, self._columns.carried], self._first)
         return outputs
