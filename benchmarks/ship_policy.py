@@ -1,13 +1,13 @@
 """Put the policy of a run beside the package.
 
-``python -m benchmarks.ship_policy run=RUN name=NAME [first=RUN] [episodes=31]``
+``python -m benchmarks.ship_policy run=RUN name=NAME [before=RUN,RUN] [episodes=31]``
 
 Writes ``assets/policies/NAME``: the run's configuration and origin, its curves (every tenth iteration), a checkpoint
 that holds only the policy (without what only training needs), and evaluations on the CPU engine: on flat ground
 with noise, with nothing random (``rand=none``), with noise at 100 Hz, on the ground of training with all that training
 does to a robot, and under the acceptance criteria (``go1exp/evaluate/criteria.py``): stiff feet, dry friction, delay.
-``first`` is the run that ``run`` started from (``start_from``): its configuration, origin and curves go to
-``first_stage``. Without ``run`` the present policy is evaluated again.
+``before`` are the runs that led to ``run`` (``start_from``), the oldest first: their configurations and origins go to
+``stage_1`` and so on. Without ``run`` the present policy is evaluated again.
 A tree with changes, or a run from one, is refused: the origin of a shipped policy is a commit.
 """
 
@@ -59,9 +59,6 @@ CRITERIA_GRID = {
 COMBINED = (1.0, 0.3, 0.5)
 """One command of all three kinds."""
 
-FIRST = "first_stage"
-"""Folder for the origin of the run that a policy's run started from."""
-
 EVERY = 10
 """Iterations between rows of the shipped curves."""
 
@@ -70,21 +67,21 @@ def shipped(run: Path, to: Path) -> None:
     """Copy the parts of a shipped policy: configuration, origin, curves, the policy's weights."""
     state, path = checkpoint.load_latest(run)
     (to / "checkpoints").mkdir(parents=True, exist_ok=True)
-    for old in [*(to / "checkpoints").glob("*"), *(to / FIRST).glob("*"), to / policy.START]:
+    for old in [*(to / "checkpoints").glob("*"), *to.glob("stage_*/*"), to / policy.START]:
         old.unlink(missing_ok=True)
     kept = {name: state[name] for name in ("format", "policy", "iteration", "num_timesteps")}
     torch.save(kept, to / "checkpoints" / path.name)
     copy_origin(run, to)
+    head, *rows = (run / "metrics.csv").read_text().splitlines(keepends=True)
+    (to / "metrics.csv").write_text("".join([head, *rows[9::EVERY]]))
 
 
 def copy_origin(run: Path, to: Path) -> None:
-    """Copy the origin of a policy from its run: configuration, versions, curves."""
+    """Copy the origin of a policy from its run: configuration, versions, what it started from."""
     to.mkdir(exist_ok=True)
     for name in ("config.yaml", "meta.json", policy.START):
         if (run / name).exists():
             shutil.copyfile(run / name, to / name)
-    head, *rows = (run / "metrics.csv").read_text().splitlines(keepends=True)
-    (to / "metrics.csv").write_text("".join([head, *rows[9::EVERY]]))
 
 
 def evaluate_criteria(task: TaskConfig, policy: Policy, about: dict[str, Any]) -> dict[str, Any]:
@@ -111,19 +108,20 @@ def refuse_changes(present: str, runs: Sequence[Path]) -> None:
 def main(arguments: Sequence[str]) -> None:
     """Copy and evaluate."""
     given = dict(a.split("=", 1) for a in arguments if "=" in a)
-    if not {"name"} <= set(given) <= {"run", "name", "first", "episodes", "only"} or given.get(
+    if not {"name"} <= set(given) <= {"run", "name", "before", "episodes", "only"} or given.get(
         "only", "criteria"
     ) not in (*EVALUATIONS, "criteria"):
         known = "|".join((*EVALUATIONS, "criteria"))
         raise SystemExit(
-            f"usage: python -m benchmarks.ship_policy [run=RUN] name=NAME [first=RUN] [episodes=31] [only={known}]"
+            f"usage: python -m benchmarks.ship_policy [run=RUN] name=NAME [before=RUN,RUN] [episodes=31] [only={known}]"
         )
-    refuse_changes(commit(), [Path(given[key]) for key in ("run", "first") if key in given])
+    before = [Path(run) for run in given.get("before", "").split(",") if run]
+    refuse_changes(commit(), [*before, *(Path(given[key]) for key in ("run",) if key in given)])
     to = data_root() / "assets" / "policies" / given["name"]
     if "run" in given:
         shipped(Path(given["run"]), to)
-        if "first" in given:
-            copy_origin(Path(given["first"]), to / FIRST)
+        for number, run in enumerate(before, 1):
+            copy_origin(run, to / f"stage_{number}")
     config, policy, about = load_run(to)
     about["file"] = str(Path(about["file"]).relative_to(data_root()))
     usual = {"seconds": 20.0, "settle_s": 2.0, "policy_dt": None, "seed": 1}

@@ -78,6 +78,7 @@ EXEMPT = {
     "controller/policy.yaml:controller": "the name of the choice",
     "experiment/ablation/*.yaml:schedule": "ramps that are taken away with their rows, or wait for another one",
     "experiment/rough.yaml:reward.foot_clock.excess": "of feet higher than asked, which come later: test_rewards",
+    "experiment/rough_climb.yaml:reward.foot_clock": "of feet before a step, which come later: test_rewards",
     "reward/paper_literal.yaml:reward.air_time_variance.weight": "as printed, the term is zero for every gait",
     "launcher/*.yaml:launcher": "needs several cores, or a cluster: tests/test_sweeps.py, test_slurm.py",
     "study/*.yaml:study": "jobs of a sweep: tests/test_configs.py",
@@ -146,6 +147,7 @@ NEEDS = {
     "experiment/robust": ["experiment=clock", "backend=cpu"],
     "experiment/robust_history": ["experiment=robust", "backend=cpu"],
     "experiment/rough": ["experiment=robust_history", "terrain=steps", "observation=proprioception", "backend=cpu"],
+    "experiment/rough_climb": ["experiment=rough", "backend=cpu", "terrain.obstacles_proportion=0.6"],
 }
 """Choices that other choices must go with."""
 
