@@ -43,26 +43,26 @@ def add_to_spec(spec: mujoco.MjSpec, terrain: Terrain) -> mujoco.MjsGeom:
         name=FLOOR, contype=1, conaffinity=0, condim=3, friction=list(FRICTION), material=FLOOR, group=0
     )
     floor.castshadow = False  # it would only speckle itself, and every triangle would be drawn twice
+    flat = terrain.config.kind == "flat"
+    spec.add_texture(
+        name=FLOOR,
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        mark=mujoco.mjtMark.mjMARK_EDGE,
+        rgb1=[0.34, 0.38, 0.42] if flat else [0.52, 0.50, 0.45],
+        rgb2=[0.28, 0.32, 0.36] if flat else [0.47, 0.45, 0.40],
+        markrgb=[0.5, 0.54, 0.58] if flat else [0.38, 0.36, 0.32],  # lines show the edges of steps, too
+        width=300,
+        height=300,
+    )
     material = spec.add_material(name=FLOOR, specular=0.1, shininess=0.1)
-    if terrain.config.kind == "flat":
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = FLOOR
+    material.texrepeat = [2.0, 2.0]  # with texuniform: per metre, so a square has an edge of 0.5 m
+    material.texuniform = True
+    if flat:
         floor.type = mujoco.mjtGeom.mjGEOM_PLANE
         floor.size = [0.0, 0.0, 0.05]
-        spec.add_texture(
-            name=FLOOR,
-            type=mujoco.mjtTexture.mjTEXTURE_2D,
-            builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-            mark=mujoco.mjtMark.mjMARK_EDGE,
-            rgb1=[0.34, 0.38, 0.42],
-            rgb2=[0.28, 0.32, 0.36],
-            markrgb=[0.5, 0.54, 0.58],
-            width=300,
-            height=300,
-        )
-        material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = FLOOR
-        material.texrepeat = [2.0, 2.0]  # with texuniform: per metre, so a square has an edge of 0.5 m
-        material.texuniform = True
     else:
-        material.rgba = [0.52, 0.50, 0.45, 1.0]
         low, high = float(terrain.heights.min()), float(terrain.heights.max())
         span = high - low if high > low else 1.0
         x_min, x_max, y_min, y_max = terrain.extent
