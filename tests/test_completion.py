@@ -24,7 +24,7 @@ from go1exp.sim.task import PPOConfig
 
 PROGRAM = "import sys; from go1exp.cli import main; sys.exit(main())"
 
-POLICIES = ("clock", "paper", "robust", "robust_history")
+POLICIES = ("clock", "paper", "robust", "robust_history", "rough")
 """Shipped ones."""
 
 
