@@ -91,7 +91,7 @@ def moved(task: TaskConfig, robots: int, change: Change) -> NDArray[np.float64]:
     backend.reset(everyone, like(qpos), torch.zeros_like(backend.qvel))
     bound = like(np.asarray(limit))
     for target in map(like, targets):
-        for _ in range(round(task.sim.policy_dt / task.sim.physics_dt)):
+        for _ in range(task.sim.decimation):
             torque = 20.0 * (target - backend.qpos[:, 7:]) - 0.5 * backend.qvel[:, 6:]
             backend.step(torch.clamp(torque, -bound, bound))
     return backend.qpos.double().cpu().numpy()

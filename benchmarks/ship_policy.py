@@ -116,7 +116,7 @@ def main(arguments: Sequence[str]) -> None:
             f"usage: python -m benchmarks.ship_policy [run=RUN] name=NAME [before=RUN,RUN] [episodes=31] [only={known}]"
         )
     before = [Path(run) for run in given.get("before", "").split(",") if run]
-    refuse_changes(commit(), [*before, *(Path(given[key]) for key in ("run",) if key in given)])
+    refuse_changes(commit(), [*before, *map(Path, [given["run"]] if "run" in given else [])])
     to = data_root() / "assets" / "policies" / given["name"]
     if "run" in given:
         shipped(Path(given["run"]), to)

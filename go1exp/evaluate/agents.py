@@ -141,20 +141,15 @@ class PolicyAgent(Agent):
         return _RunningPolicy(self, core, trunk_velocity, seed)
 
 
-_Memory = tuple[Past[Tensor], Past[Tensor], Past[Tensor], Tensor | None, Tensor | None, Tensor | None]
-
-
 class _RunningPolicy:
     def __init__(self, agent: PolicyAgent, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> None:
         self._policy, self._limits = agent.policy, agent.task.action.limits
         self._filter = estimator(core, trunk_velocity, seed)
         # A policy that runs faster than it was trained: its mean action and its frames of a training period (``Past``).
         periods = agent.task.sim.policy_dt, core.task.sim.policy_dt
-        self._actions, self._bounding, self._frames = (Past[Tensor](*periods) for _ in range(3))
+        self._actions, self._frames = Past[Tensor](*periods), Past[Tensor](*periods)
         self._columns = columns(core.task, "previous_action") if self._actions.cycles > 1 else None
         self._history = history_columns(core.task.observation)
-        self._previous: Tensor | None = None
-        self._before: Tensor | None = None
         self._earlier: Tensor | None = None
 
     def __call__(self, observation: Tensor) -> Tensor:
@@ -162,25 +157,22 @@ class _RunningPolicy:
             return self._policy(observation)
         observation = observation.clone() if self._filter is None else self._filter.put(observation)
         if self._columns is not None:
-            observation[:, self._columns] = 0.0 if self._previous is None else self._previous
+            observation[:, self._columns] = self._actions.mean()
         history = self._history
         observation[:, history.earlier] = observation[:, history.newest] if self._earlier is None else self._earlier
         action = self._policy(observation)
         if self._actions.cycles > 1:  # else the environment limits it
-            before = torch.zeros_like(action) if self._before is None else self._before
-            action = limited(action, before, *self._limits)
-            self._before = self._bounding.after(action, before)
-            self._previous = self._actions.mean(action)
-        self._earlier = self._frames.after(observation[:, history.carried], observation[:, history.earlier])
+            action = limited(action, self._actions.earlier(torch.zeros_like(action)), *self._limits)
+            self._actions.add(action)
+        self._frames.add(observation[:, history.carried])
+        self._earlier = self._frames.earlier(observation[:, history.earlier])
         return action
 
-    def save(self) -> _Memory | None:
-        pasts, values = (self._actions, self._bounding, self._frames), (self._previous, self._before, self._earlier)
-        return None if self._filter else copy.deepcopy((*pasts, *values))
+    def save(self) -> tuple[Past[Tensor], Past[Tensor], Tensor | None] | None:
+        return None if self._filter else copy.deepcopy((self._actions, self._frames, self._earlier))
 
-    def load(self, state: _Memory) -> None:
-        self._actions, self._bounding, self._frames, *values = copy.deepcopy(state)
-        self._previous, self._before, self._earlier = values
+    def load(self, state: tuple[Past[Tensor], Past[Tensor], Tensor | None]) -> None:
+        self._actions, self._frames, self._earlier = copy.deepcopy(state)
 
 
 @dataclass(frozen=True)

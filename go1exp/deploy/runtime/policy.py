@@ -102,7 +102,7 @@ A = TypeVar("A", bound=Any)  # an array of NumPy or torch
 
 
 class Past(Generic[A]):
-    """Values of the last training period of a policy that may run faster than it was trained.
+    """Newest values, of one training period of a policy that may run faster than it was trained.
 
     Args:
         trained: period of the policy in training, s.
@@ -116,17 +116,19 @@ class Past(Generic[A]):
         self.cycles = max(1, round(trained / period))
         self._kept: deque[A] = deque(maxlen=self.cycles)
 
-    def after(self, newest: A, before: A) -> A:
-        """Add a value; return that of one training period before the next cycle, ``before`` if there is none."""
+    def add(self, newest: A) -> None:
+        """Add the value of a cycle."""
         self._kept.append(newest)
+
+    def earlier(self, before: A) -> A:
+        """Return the value of one training period before the next cycle, ``before`` if there is none."""
         return before if len(self._kept) < self.cycles else self._kept[0]
 
-    def mean(self, newest: A) -> A:
-        """Add a value; return the mean over the last training period, with 0 before the first value.
+    def mean(self) -> A:
+        """Return the mean over the last training period, with 0 before the first value.
 
         Of actions: that of one training period ago would let the cycles between two of them go separate ways.
         """
-        self._kept.append(newest)
         return sum(self._kept) / self.cycles
 
 
@@ -147,7 +149,6 @@ class PolicyMemory:
         }
         self._columns = columns_of((block.size // block.history, block.history) for block in about.observation)
         self._actions = Past[np.ndarray](about.policy_dt, period)
-        self._bounding = Past[np.ndarray](about.policy_dt, period)
         self._frames = Past[np.ndarray](about.policy_dt, period)
         self._first: np.ndarray | None = None
 
@@ -160,10 +161,12 @@ class PolicyMemory:
             self._first = policy(readings)["observation"][:, self._columns.newest]
             readings["past"] = self.values["past"] = self._first
         outputs = policy(readings)
+        self._actions.add(outputs["action"])
         if "previous_action" in self.values:
-            self.values["previous_action"] = self._actions.mean(outputs["action"])
+            self.values["previous_action"] = self._actions.mean()
         if "earlier_action" in self.values:
-            self.values["earlier_action"] = self._bounding.after(outputs["action"], self.values["earlier_action"])
+            self.values["earlier_action"] = self._actions.earlier(self.values["earlier_action"])
         if self._first is not None:
-            self.values["past"] = self._frames.after(outputs["observation"][:, self._columns.carried], self._first)
+            self._frames.add(outputs["observation"][:, self._columns.carried])
+            self.values["past"] = self._frames.earlier(self._first)
         return outputs
