@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import gc
 import math
+import weakref
 from collections.abc import Callable
 from typing import Any
 
@@ -280,6 +282,15 @@ def test_an_iteration_reports_once_when_its_update_is_complete() -> None:
     ppo.after_iteration = lambda p: seen.append((p.iteration, p.num_timesteps, p._n_updates))
     learn(ppo, 3)
     assert seen == [(1, 64, 2), (2, 128, 4), (3, 192, 6)]
+
+
+def test_a_learner_that_nobody_holds_any_more_is_freed() -> None:
+    ppo = slider_ppo()
+    learn(ppo, 1)
+    held = weakref.ref(ppo)
+    del ppo
+    gc.collect()  # Hydra runs the jobs of a sweep in one process
+    assert held() is None
 
 
 # ---------------------------------------------------------------------- SB3's object

@@ -9,6 +9,7 @@ minibatches in place of SB3's).
 from __future__ import annotations
 
 import itertools
+import weakref
 from collections.abc import Callable, Generator
 from functools import partial
 from typing import Any
@@ -182,9 +183,11 @@ class AdaptivePPO(PPO):
     def _setup_model(self) -> None:
         super()._setup_model()
         self.rollout_buffer.policy = self.policy
+        # Weakly: a hook of torch would keep the learner, and its robots, for ever.
+        check = partial(type(self)._check_gradient, weakref.proxy(self))
         for name, parameter in self.policy.named_parameters():
             # Before the gradients' norm is clipped, which would spread a NaN to all of them.
-            parameter.register_post_accumulate_grad_hook(partial(self._check_gradient, name))
+            parameter.register_post_accumulate_grad_hook(partial(check, name))
 
     def _maybe_recommend_cpu(self, mlp_class_name: str = "ActorCriticPolicy") -> None:
         """Say nothing: the user chose the device."""
