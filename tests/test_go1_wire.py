@@ -514,6 +514,16 @@ def test_a_tick_wraps_around(pair: Linked) -> None:
     assert link.traffic.late == 0
 
 
+def test_the_clock_of_a_state_is_its_tick_however_many_came_before(pair: Linked) -> None:
+    """After weeks, where a sum of periods would have drifted the most in so few states."""
+    link, other, address = pair
+    first, clocks = 2**32 - 500, []
+    for k in range(500):
+        other.sendto(sent((first + 2 * k) % 2**32), address)
+        clocks += [one.clock for one in link.receive()]
+    np.testing.assert_allclose(clocks, 0.001 * (first + 2.0 * np.arange(500)), rtol=0.0, atol=1e-9)
+
+
 def test_a_command_is_sent_again_between_two_cycles(pair: Linked) -> None:
     link, other, _ = pair
     link.send(command())

@@ -115,7 +115,8 @@ class Go1Link:
         self.tick: int | None = None
         self._first = 0
         self._ticks: deque[int] = deque(maxlen=REMEMBERED)
-        self._clock, self._packet = math.nan, go1_wire.IDLE
+        self._count, self._clock = 0, math.nan
+        self._packet = go1_wire.IDLE
         self._last_sent, self.sent_at = -math.inf, math.nan
 
     @property
@@ -155,12 +156,12 @@ class Go1Link:
             return self._overtaken(data, ancillary, tick, ahead)
         if ahead is None:
             self._first = tick
-        if ahead is None or math.isnan(self._clock):  # the first, or the first since the tick's unit is known
-            self._clock = tick * self.tick_s
-        else:
-            # By whole ticks since the first: a float of a tick that has wrapped around would jump back.
-            self._clock += ahead * self.tick_s
+        # The count goes on where the tick wraps around. It is whole: a sum of seconds drifts by a microsecond in hours,
+        # and then no state is found among the robot's applied commands.
+        self._count = tick if ahead is None else self._count + ahead
+        if ahead is not None and not math.isnan(self._clock):  # not the first since the tick's unit is known
             self.traffic.lost += max(round(ahead * self.tick_s / PERIOD) - 1, 0)
+        self._clock = self._count * self.tick_s
         self.traffic.received += 1
         self.tick, self.newest = tick, data
         self._ticks.append(tick)
@@ -176,7 +177,7 @@ class Go1Link:
         self.traffic.overtaken += 1
         self.traffic.lost -= 1
         self._ticks.append(tick)
-        return go1_wire.unpack_state(data, arrival(ancillary), self._clock + ahead * self.tick_s)
+        return go1_wire.unpack_state(data, arrival(ancillary), (self._count + ahead) * self.tick_s)
 
     def _put(self, packet: bytes) -> None:
         """Send a packet; one that cannot be sent counts as lost in the network."""
