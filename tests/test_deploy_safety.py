@@ -597,6 +597,20 @@ def test_reports_come_about_every_second() -> None:
     assert reported == [11, 21, 31]
 
 
+def test_the_percentiles_of_a_report_are_over_the_newest_cycles_alone() -> None:
+    """Those over all take longer than a cycle, every second, once a walk has lasted for minutes."""
+    clock, reported = FakeClock(), list[float]()
+
+    def work(now: float) -> bool:
+        clock.t += 0.005 if now < 120.0 else 0.001
+        return True
+
+    timing = run(work, 100.0, seconds=40.0, clock=clock, on_report=lambda t: reported.append(t.work_p99))
+    assert reported[0] == pytest.approx(0.005)
+    assert reported[-1] == pytest.approx(0.001)
+    assert timing.work_p99 == pytest.approx(0.005)
+
+
 def test_the_collector_is_off_in_the_loop_and_back_after_it() -> None:
     readings: list[bool] = []
 

@@ -18,6 +18,9 @@ import numpy as np
 KEPT = 200_000
 """Newest cycles that are kept for the percentiles: 500 s at 400 Hz."""
 
+REPORTED = 1_000
+"""Newest cycles for the percentiles of a report in the loop: those of ``KEPT`` take longer than a cycle at 400 Hz."""
+
 
 BETWEEN_S = 0.002
 """Period at which a clock lets something be done between two cycles, s: that of the Go1's packets."""
@@ -71,7 +74,7 @@ class MonotonicClock:
 
 @dataclass(frozen=True)
 class Timing:
-    """Timing of a loop; percentiles are over the newest ``KEPT`` cycles, everything else over all.
+    """Timing of a loop; percentiles are over the newest ``KEPT`` cycles, in reports ``REPORTED``; all else over all.
 
     Attributes:
         cycles: number of cycles that ran.
@@ -143,10 +146,10 @@ class Deadlines:
         self.left_out += left_out
         self.missed += left_out + (end > due + self._period)
 
-    def timing(self) -> Timing:
-        """Return the timing so far."""
-        periods = self._periods[: min(max(self.cycles - 1, 0), len(self._periods))]
-        work = self._work[: min(self.cycles, len(self._work))]
+    def timing(self, newest: int = KEPT) -> Timing:
+        """Return the timing so far, with percentiles over at most the ``newest`` cycles that are kept."""
+        periods = _last(self._periods, max(self.cycles - 1, 0), newest)
+        work = _last(self._work, self.cycles, newest)
         p50, p99 = np.percentile(periods, [50, 99]) if len(periods) else (0.0, 0.0)
         w50, w99 = np.percentile(work, [50, 99]) if len(work) else (0.0, 0.0)
         return Timing(
@@ -161,6 +164,12 @@ class Deadlines:
             missed=self.missed,
             left_out=self.left_out,
         )
+
+
+def _last(ring: np.ndarray, written: int, most: int) -> np.ndarray:
+    """Return at most ``most`` of the newest numbers of a ring into which so many were ``written``."""
+    count = min(written, len(ring), most)
+    return ring[np.arange(written - count, written) % len(ring)]
 
 
 def run(
@@ -209,7 +218,7 @@ def run(
             if not wanted:
                 break
             if on_report is not None and end >= next_report:
-                on_report(deadlines.timing())
+                on_report(deadlines.timing(REPORTED))
                 next_report = end + report_every
     finally:
         if collecting:
