@@ -19,6 +19,8 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from go1exp.base.paths import data_root
+from go1exp.cli import hydra_main, sweep
+from go1exp.cli.train import APP as TRAIN
 from go1exp.cli.tune import _ranges
 from go1exp.config.schema.registry import ConfigError
 from go1exp.train import run_state
@@ -30,6 +32,36 @@ from go1exp.train.sweep.slurm import Slurm
 from go1exp.train.sweep.tune import Range
 
 CONF = data_root() / "conf"
+
+
+def test_what_jobs_need_is_checked_once_without_comparing_each_with_all_others(tmp_path: Path) -> None:
+    """Their number is up to 10,000; a seed alone changes nothing that they need."""
+    checked, compared = list[str](), list[object]()
+
+    class Setting(str):
+        def __eq__(self, other: object) -> bool:
+            compared.append(other)
+            return super().__eq__(other)
+
+        __hash__ = str.__hash__
+
+    def resolve(container: dict[str, Any], overrides: list[str], run: Path) -> Any:
+        return SimpleNamespace(container={"gamma": Setting(container["ppo"]["gamma"]), "seed": container["seed"]})
+
+    def check(job: Any) -> None:
+        checked.append(str(job.container["gamma"]))
+        raise ConfigError(["out of memory"])
+
+    def never(*_: Any) -> Any:
+        raise AssertionError
+
+    gammas = [f"0.9{k}" for k in range(1, 7)]
+    jobs = [[f"ppo.gamma={gamma}", f"seed={seed}"] for seed in (0, 1) for gamma in gammas]
+    asked = hydra_main.Sweep(tmp_path / "sweep", jobs, {"name": "basic"})
+    with pytest.raises(ConfigError, match="out of memory"):
+        sweep.begin(sweep.Rules(resolve, check, never, never, never), TRAIN, [], asked)
+    assert checked == gammas
+    assert not compared
 
 
 def test_folders_are_named_by_overrides() -> None:
