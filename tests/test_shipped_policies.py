@@ -22,6 +22,8 @@ from go1exp.train.policy import load_run
 
 NAMES = sorted(shipped_policies())
 
+POLICIES = Path(__file__).parents[1] / "docs/policies.md"
+
 
 def test_there_are_the_papers_and_one_that_trots() -> None:
     assert {"clock", "paper", "robust", "robust_history", "rough"} <= set(NAMES)
@@ -33,6 +35,16 @@ def test_the_page_of_a_policy_names_the_commit_of_its_record(name: str) -> None:
     page, record = (folder / "README.md").read_text(), json.loads((folder / "meta.json").read_text())
     assert re.findall(r"commit\s+([0-9a-f]{7,40})", page) == [record["git"][:7]]
     assert ("uncommitted changes" in page) == record["git_dirty"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_policy_counts_the_steps_of_all_its_trainings(name: str) -> None:
+    row = re.search(rf"^\| `{name}` \|.*\| (\d+) M", POLICIES.read_text(), re.MULTILINE)
+    assert row
+    folder = shipped_policies()[name]
+    assert round(load_run(folder)[2]["num_timesteps"] / 1e6) == int(row[1])
+    for file in folder.glob("eval_*.json"):
+        assert round(json.loads(file.read_text())["policy"]["num_timesteps"] / 1e6) == int(row[1])
 
 
 def test_a_policy_of_changed_files_is_not_shipped(tmp_path: Path) -> None:
