@@ -193,7 +193,7 @@ OTHER: dict[str, Any] = {
     **given("""
         train:backend.threads=2 train:torch_threads=2 train:device=cuda train:start_from=paper
         train:actuator.period=resample eval:physics_dt=0.0025 eval:measures=[stride_rate]
-        play:out=other.gif play:physics_dt=0.0025 record:excitation=[steps]
+        play:out=other.gif play:physics_dt=0.0025 play:tile=[2,1] record:excitation=[steps]
         record_import:source=so101_arm record_import:drop=impossible
         fit-actuator:gains=[20.0,0.5] fit-actuator:inputs=[position_error] fit-actuator:period=0.004
         fit-actuator:smoothing=0.02

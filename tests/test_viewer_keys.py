@@ -15,7 +15,9 @@ pytest.importorskip("mujoco.studio")
 
 from go1exp.cli.app import app_of
 from go1exp.config.compose import compose
+from go1exp.config.schema.registry import ConfigError
 from go1exp.deploy.export.build import build
+from go1exp.evaluate import video
 from go1exp.evaluate.viewer import requests as ask
 from go1exp.evaluate.viewer import sim_process, web
 from go1exp.evaluate.viewer.page_server import FIRST_PORT, listening
@@ -109,3 +111,36 @@ def test_a_bundle_walks_on_the_page_and_hands_over(
         show.ask(ask.SelectPolicy(label))
         assert (session.label, session.message) == (label, "")
         show.tick()
+
+
+@pytest.mark.parametrize("viewer", ["clip", "web"])
+def test_the_first_tile_is_the_named_one_or_one_that_shows_the_ground(
+    viewer: str, tmp_path: Path, opened: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trained(tmp_path / "run", "terrain=flat")
+    filmed: list[Any] = []
+
+    def record(core: Any, *_: Any, **__: Any) -> Any:
+        filmed.append(core)
+        return iter([])
+
+    monkeypatch.setattr(video, "record", record)
+    monkeypatch.setattr(video, "write_gif", lambda *_: None)
+    monkeypatch.setattr(video, "write_strip", lambda *_: None)
+
+    def begun(*overrides: str) -> tuple[int, str]:
+        words = [f"run={tmp_path / 'run'}", f"viewer={viewer}", f"out={tmp_path / 'a.gif'}", *overrides]
+        app_of("play").task(compose("play", words))
+        core = filmed[-1] if viewer == "clip" else opened[-1][1].session.core
+        core.reset()
+        row, column = int(core.level[0]), int(core.tile_column[0])
+        assert np.allclose(core.spawn[0], core.terrain.tile_origins[row, column], atol=1e-6)
+        return row, core.terrain.tile_types[column]
+
+    assert begun("terrain=steps", "tile=[3,13]") == (3, "stairs_down")
+    assert begun("terrain=steps") == (4, "stairs_up")
+    for tile, said in (("[10,0]", "10 rows and 20 columns"), ("[0,20]", "counted from 0")):
+        with pytest.raises(ConfigError, match=said):
+            begun("terrain=steps", f"tile={tile}")
+    with pytest.raises(ConfigError, match="needs graded ground"):
+        begun("tile=[0,0]")

@@ -12,7 +12,7 @@ from go1exp.base import memory
 from go1exp.cli import subjects
 from go1exp.cli.app import App, parse, spinner
 from go1exp.cli.evaluate import writable_file
-from go1exp.cli.play_web import PlaySettings, address, log, walk
+from go1exp.cli.play_web import PlaySettings, address, first_tile, log, walk
 from go1exp.cli.subjects import agent
 from go1exp.config.schema.registry import ConfigError
 
@@ -63,9 +63,21 @@ def _task(container: dict[str, object]) -> None:
     shown_task = evaluation_task(drives.task, shown)
     if ground is not None:
         shown_task = dataclasses.replace(shown_task, terrain=ground)
+    tile = first_tile(shown_task.terrain, settings.tile)
     require_agreement(shown_task)
     core = Go1Core(shown_task, 1, settings.seed, noise=settings.noise, imu=drives.senses)
+    if tile:
+        _stand_on(core, *tile)
     _show(core, drives.begin(core, "exact", settings.seed), settings, out, progress)
+
+
+def _stand_on(core: Go1Core, row: int, column: int, kind: str) -> None:
+    """Let episodes begin on a tile, and say on which: the first reset would draw a row, and the column is the first."""
+    core.reset()
+    core.level.fill_(row)
+    core.tile_column.fill_(column)
+    whither = " towards its middle, where the robot begins" if "_" in kind else ""
+    print(f"on tile [{row},{column}] of {core.terrain.config.rows} rows: {kind}{whither}", flush=True)
 
 
 def _ground(container: dict[str, object]) -> TerrainConfig | None:

@@ -19,7 +19,7 @@ from go1exp.cli.subjects import Named, agent, word
 from go1exp.config.choices import choice_files, config_folder, load
 from go1exp.config.schema import settings as schema
 from go1exp.config.schema.physics import PhysicsStep
-from go1exp.config.schema.registry import ConfigError, Duration, FolderName, Speed
+from go1exp.config.schema.registry import ConfigError, CountOrZero, Duration, FolderName, Speed
 from go1exp.config.schema.settings import subset
 from go1exp.deploy.sim_robot import SimConfig, SimSettings
 
@@ -56,6 +56,8 @@ class PlaySettings:
         randomize: randomise the robot as in training; false takes the nominal robot.
         push: push the robot as in training.
         train_ground: use the ground of training; false is flat.
+        tile: row and column of its first tile of graded ground, counted from 0; difficulty grows with the row. null: in
+            the middle, and not flat.
         physics_dt: another physics step, s, such as 0.002 for a policy trained with coarser steps; null keeps that of
             training.
         seed: seed of everything random.
@@ -78,6 +80,7 @@ class PlaySettings:
     randomize: bool
     push: bool
     train_ground: bool
+    tile: tuple[CountOrZero, CountOrZero] | None
     physics_dt: PhysicsStep | None
     seed: Annotated[int, Field(ge=0)]
     out: str | None
@@ -109,6 +112,25 @@ def require_studio() -> None:
         )
 
 
+def first_tile(ground: TerrainConfig, wanted: tuple[int, int] | None) -> tuple[int, int, str] | None:
+    """Return row, column and kind of the tile to begin on, None on a plane; raise ConfigError if there is no such."""
+    from go1exp.sim.terrain import column_types
+
+    if ground.kind == "flat":
+        if wanted is None:
+            return None
+        raise ConfigError([f"tile = {list(wanted)}: needs graded ground; use terrain=rough, or train_ground=true"])
+    kinds = column_types(ground)
+    if wanted is None:
+        uneven = [column for column, kind in enumerate(kinds) if kind != "flat"] or [0]
+        wanted = (ground.rows - 1) // 2, uneven[len(uneven) // 2]
+    row, column = wanted
+    if row >= ground.rows or column >= ground.cols:
+        has = f"the ground has {ground.rows} rows and {ground.cols} columns, counted from 0"
+        raise ConfigError([f"tile = {list(wanted)}: {has}"])
+    return row, column, kinds[column]
+
+
 def walk(
     subject: Named,
     other: dict[str, object],
@@ -128,13 +150,17 @@ def walk(
         from go1exp.evaluate.viewer.requests import Setup, catalogue
         from go1exp.evaluate.viewer.session import Robots, Session
         from go1exp.evaluate.viewer.walk import WalkShow
+        from go1exp.sim.terrain import TerrainConfig
 
         first = agent(subject, other)
-        name, grounds = _grounds(ground or (first.task.terrain if settings.train_ground else None))
+        wanted = ground or (first.task.terrain if settings.train_ground else TerrainConfig())
+        begin = first_tile(wanted, settings.tile)
+        name, grounds = _grounds(wanted)
         effects, sizes = catalogue(first.task.effect, settings.randomize)
         setup = Setup(
             ground=name,
-            level=grounds[name].hardest / 2,
+            level=begin[0] if begin else 0.0,
+            tile=begin[2] if begin else None,
             sizes=sizes,
             noise=settings.noise,
             physics_dt=settings.physics_dt,
