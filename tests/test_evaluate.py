@@ -383,6 +383,31 @@ def test_a_folder_without_checkpoints_is_named(trained: tuple[Path, TrainConfig]
 QUIET = EvalConfig(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), episodes=3, seconds=1.0, settle_s=0.4)
 
 
+@pytest.mark.parametrize(("episodes", "expected"), [(2, [0, 3]), (5, [0, 1, 2, 3, 4]), (7, [0, 1, 2, 3, 4, 5, 0])])
+def test_commands_are_compared_on_the_same_kinds_of_ground(
+    make_task: MakeTask, monkeypatch: pytest.MonkeyPatch, episodes: int, expected: list[int]
+) -> None:
+    tiles = ("terrain.rows=2", "terrain.cols=6", "terrain.tile_size=4.0", "terrain.border=2.0")
+    task = make_task("backend.threads=1", "terrain=rough", *tiles)
+    seen: list[list[int]] = []
+
+    def drawn(core: Go1Core) -> dict[str, Any]:
+        seen.append(core.tile_column.tolist())
+        assert np.allclose(core.spawn[:, 1], core.terrain.tile_origins[0, core.tile_column, 1])
+        return {}
+
+    monkeypatch.setattr(rollout, "drawn", drawn)
+    config = dataclasses.replace(
+        QUIET, commands=((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), episodes=episodes, train_ground=True
+    )
+    evaluate(
+        task,
+        lambda observation: torch.zeros(len(observation), 12),
+        dataclasses.replace(config, seconds=0.1, settle_s=0.0),
+    )
+    assert seen == [expected * 2]
+
+
 def hop() -> Callable[[Tensor], Tensor]:
     """A policy that bends and stretches all legs, four times a second."""
     step = [0]

@@ -115,6 +115,7 @@ def evaluate(
     # Robot i has command i // episodes: the robots of one command are neighbours.
     commands = torch.tensor(config.commands, dtype=torch.float32)
     core.command.value.copy_(commands.repeat_interleave(config.episodes, 0))
+    _share_ground(core, config)
     observation = core.reset()
     draws = drawn(core)  # robots that fall are drawn anew
     tally = _Tally(count)
@@ -143,6 +144,13 @@ def evaluate(
         commands=core.command.value.double().numpy(), draws=draws, measures=of_robots, **tally.each(config)
     )
     return report
+
+
+def _share_ground(core: Go1Core, config: EvalConfig) -> None:
+    """Give each command the same columns of tiles, of all kinds: else it is judged by what its robots stand on."""
+    columns, each = len(core.terrain.tile_types), torch.arange(config.episodes)
+    spread = each * columns // config.episodes if config.episodes < columns else each % columns
+    core.tile_column.copy_(spread.repeat(len(config.commands)))
 
 
 def _steps(config: EvalConfig, dt: float) -> tuple[int, int]:
