@@ -105,6 +105,19 @@ def test_weights_of_another_function_are_refused(first: Path, override: str, sai
         policy.read_weights(config, first)
 
 
+def test_an_estimator_of_another_size_is_refused_and_another_weight_of_its_loss_is_not(tmp_path: Path) -> None:
+    estimating = ("critic=privileged", "estimator=decoder", "estimator.latent=4", "estimator.hidden=[8]")
+    train_here(tmp_path / "first", *estimating)
+    for overrides, said in (
+        ((*estimating, "estimator.latent=5"), "estimator.latent is 5 here and 4 there$"),
+        ((*estimating, "estimator.hidden=[9]"), r"estimator.hidden is \[9\] here and \[8\] there$"),
+        (("critic=privileged",), "estimator.latent is 0 here and 4 there$"),
+    ):
+        with pytest.raises(ConfigError, match=f"policy of this run: {said}"):
+            policy.read_weights(parse_train(compose("train", [*SMALL, *overrides])), tmp_path / "first")
+    train_here(tmp_path / "second", *estimating, "estimator.weight=0.5", source=tmp_path / "first")
+
+
 def test_from_the_command_line(
     first: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
