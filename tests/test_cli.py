@@ -236,6 +236,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("fit-actuator recordings=nowhere", ("go1exp fit-actuator: nowhere: no such file\n",)),
         *((f"{verb}=nowhere", ("nowhere", "not a run folder")) for verb in ("eval run", "play run", "export run")),
         ("train resume=nowhere", ("nowhere", "not a run folder")),
+        ("train resume=nowhere terrain.stair_rise=[0,1]", ("stair_rise=[0,1]: a resumed run keeps its configuration",)),
+        ("train resume=nowhere curriculum.terrain_level.start_level_max=3", ("a resumed run keeps its configuration",)),
+        ("train resume=nowhere checkpoint.evry=3", ("did you mean 'checkpoint.every'",)),
         # others
         (
             "fit-actuator recordings=nowhere inputs=[speed]",

@@ -112,13 +112,17 @@ def _no_such_key(key: str, given: str, name: str, overrides: Sequence[str], fold
         known = [k for k in flat_keys(name, groups, folders) if k != key]
     except Exception:  # one of the others is wrong too
         known = [k for k in flat_keys(name) if k != key]
+    parent, _, last = key.rpartition(".")
+    if name == "train" and any(o.startswith("resume=") for o in overrides):  # whose keys are not those of the defaults
+        beside = [k.rpartition(".")[2] for k in known if k.rpartition(".")[0] == parent]
+        if not nearest(last, beside):
+            return f"{given}: a resumed run keeps its configuration; start_from begins another run with its weights"
     group, _, inside = key.partition(".")
     choices = choice_files(group, [config_folder(), *folders]) if inside and group in groups_of(name) else {}
     if choices and not any(k.startswith(f"{group}.") for k in known):
         first = inside.partition(".")[0]
         chosen = first if first in choices else "NAME"
         return f"{given}: no such key {key!r}; no file of {group} is chosen, as {group}={chosen} does"
-    parent, _, last = key.rpartition(".")
     ends = {k: k.rpartition(".")[2] for k in known} if parent else {}
     close = nearest(key, known) or [k for k, end in ends.items() if nearest(last, [end])]
     hint = f"did you mean {' or '.join(repr(c) for c in close[:3])}?" if close else "see --help"
