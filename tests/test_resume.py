@@ -7,6 +7,7 @@ import fcntl
 import json
 import os
 import pty
+import re
 import shutil
 import signal
 import subprocess
@@ -419,5 +420,8 @@ def test_the_same_folder_with_other_settings_is_refused_too(killed_copy: Path, t
     done = refuse(tmp_path, "train", *FLAT, SIX, "ppo.gamma=0.9", f"hydra.run.dir={killed_copy}")
     assert done.returncode == 2, done.stdout
     assert "ppo.gamma" in done.stderr
+    other = refuse(tmp_path, "train", "experiment=rough", "backend=cpu", f"hydra.run.dir={killed_copy}")
+    assert re.search(r" and \d+ more; use another folder$", other.stderr.strip())
+    assert len(other.stderr) < 600
     kept = {name: data for name, data in contents(killed_copy).items() if not name.startswith(".hydra")}
     assert kept == {name: data for name, data in before.items() if not name.startswith(".hydra")}

@@ -29,6 +29,8 @@ RESUMABLE = (
 """Settings that a resumed run may change: none of them changes what was computed so far (threads, devices and backend
 may change what comes after in the last bits, and another engine rounds differently). Sections, and all in them."""
 
+MOST_NAMED = 8  # settings that differ from those of another run, in a message
+
 
 def _resumed(run: Path, overrides: list[str]) -> dict[str, Any]:
     """Return the run's own configuration with the changes that resuming allows."""
@@ -62,10 +64,12 @@ def _refuse_other(run: Path, container: dict[str, object]) -> None:
     if not (run / "config.yaml").is_file():
         return
     before, after = key_values(run_folder.read_as_written(run)), key_values(container)
-    differ = sorted(k for k in {*before, *after} if before.get(k) != after.get(k) and not _may_change(k))
-    differ += [f"plugins ({name} has changed)" for name in run_folder.differing_plugins(run, container)]
+    differ = [f"plugins ({name} has changed)" for name in run_folder.differing_plugins(run, container)]
+    differ += sorted(k for k in {*before, *after} if before.get(k) != after.get(k) and not _may_change(k))
     if differ:
-        raise ConfigError([f"{run}: holds a run with other settings of {', '.join(differ)}; use another folder"])
+        beyond = f" and {len(differ) - MOST_NAMED} more" if len(differ) > MOST_NAMED else ""
+        named = ", ".join(differ[:MOST_NAMED]) + beyond
+        raise ConfigError([f"{run}: holds a run with other settings of {named}; use another folder"])
 
 
 def _source(start_from: str) -> Path:
