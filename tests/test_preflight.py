@@ -170,3 +170,30 @@ def test_a_ground_that_does_not_fit_is_refused_by_its_own_keys(monkeypatch: pyte
     preflight.check_memory(config("terrain=rough", "terrain.rows=2000"), CPU)
     with pytest.raises(ConfigError, match=r"^terrain\.rows = 100000, cols = 20: 13,\S+ samples .* 8\.0 GB are free"):
         preflight.check_memory(config("terrain=rough", "terrain.rows=100000"), CPU)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        ("terrain=steps terrain.gaps_proportion=0.02", r"^terrain\.cols = 20: too few for the shares of gaps$"),
+        ("terrain=rough terrain.cols=2", "shares of ramp_up, ramp_down, flat$"),
+        (
+            "terrain=steps terrain.stair_tread=30",
+            "^terrain: tiles of stairs_up, stairs_down are flat, also in the last of 10 rows$",
+        ),
+        (
+            "terrain=rough terrain.rows=1",
+            "^terrain: tiles of boxes, bumps, ramp_up, ramp_down are flat, also in the last of 1 rows$",
+        ),
+    ],
+)
+def test_ground_that_is_asked_for_and_missing_is_warned_of(overrides: str, said: str) -> None:
+    with pytest.warns(UserWarning, match=said):
+        preflight.check(config(*overrides.split()))
+
+
+@pytest.mark.parametrize(
+    "choice", ["terrain=flat", "terrain=rough", "terrain=steps", "experiment=rough", "experiment=rough_climb"]
+)
+def test_the_grounds_of_conf_have_all_that_they_name(choice: str) -> None:
+    preflight.warn_of_lost_ground(config(choice).task.terrain)

@@ -231,6 +231,14 @@ def column_types(config: TerrainConfig) -> tuple[str, ...]:
     return tuple(TILE_TYPES[min(int(kind), last)] for kind in kinds)
 
 
+def lost_kinds(config: TerrainConfig) -> tuple[list[str], list[str]]:
+    """Return the kinds with a share that get no column, and those whose hardest tile is flat for all that."""
+    types = column_types(config)
+    shared = [kind for kind, share in zip(TILE_TYPES, config.shares, strict=True) if share]
+    flat = [k for k in shared if k in types and not _tile(config, k, config.rows - 1, types.index(k)).any()]
+    return [kind for kind in shared if kind not in types], [kind for kind in flat if kind != "flat"]
+
+
 def _tile(config: TerrainConfig, tile_type: str, row: int, col: int) -> FloatArray:
     """Return the samples of one tile, both borders included, (n + 1, n + 1), m: 0 on the border, flat platform."""
     n = _samples(config.tile_size, config)

@@ -21,6 +21,7 @@ from go1exp.sim.env.camera import missing_for_mp4
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.engine import device_of, free_on
 from go1exp.sim.task import TrainConfig
+from go1exp.sim.terrain import TerrainConfig, lost_kinds
 from go1exp.train import metrics
 from go1exp.train.schedule import check_measures
 
@@ -45,6 +46,7 @@ def check(config: TrainConfig) -> None:
     check_shares(config)
     check_measures(config)
     check_memory(config, device_of(config.task.backend))
+    warn_of_lost_ground(config.task.terrain)  # which fits into memory
     metrics.check_account(config.logger)
     if any("file" in term.parameters for term, _ in nested_actuators(config.task.actuator)):
         Go1Core(config.task, 1)
@@ -67,6 +69,17 @@ def warn_of_idle_curriculum(config: TrainConfig) -> None:
     }
     for reason in (reason for reason, holds in reasons.items() if holds and task.curriculum):
         warnings.warn(f"curriculum.{task.curriculum[0].key}: promotes no robot; {reason}", stacklevel=3)
+
+
+def warn_of_lost_ground(terrain: TerrainConfig) -> None:
+    """Warn of kinds of ground that are asked for and that no robot will meet."""
+    absent, flat = lost_kinds(terrain) if terrain.kind == "tiles" else ([], [])
+    if absent:
+        warnings.warn(f"terrain.cols = {terrain.cols}: too few for the shares of {', '.join(absent)}", stacklevel=3)
+    if flat:
+        warnings.warn(
+            f"terrain: tiles of {', '.join(flat)} are flat, also in the last of {terrain.rows} rows", stacklevel=3
+        )
 
 
 def check_shares(config: TrainConfig) -> None:
