@@ -71,7 +71,10 @@ OTHERS = {"none", "no_curriculum", "no_phases", "no_schedule", *DEPARTURES_OF_TH
 ABLATIONS = [
     name for c in choices() if c.startswith("experiment=ablation/") and (name := c.split("/")[1]) not in OTHERS
 ]
-NEEDS = {"curriculum=terrain_level": ["terrain=rough"], "estimator=decoder": ["critic=privileged"]}
+NEEDS = {
+    **{key: ["terrain=rough"] for key in ("curriculum=terrain_level", "curriculum=hard_start")},
+    "estimator=decoder": ["critic=privileged"],
+}
 
 
 ELSEWHERE = ("experiment=ablation/", "experiment=minute_part/", "effect=")
@@ -224,6 +227,8 @@ def test_a_curriculum_is_taken_away() -> None:
     base = flat(compose("train", ["experiment=paper"]))
     without = flat(compose("train", ["experiment=[paper,ablation/no_curriculum]"]))
     assert without == {k: v for k, v in base.items() if not k.startswith("curriculum.")} != base
+    for name in ("rough", "rough_climb"):
+        assert not compose("train", [f"experiment={name}", "curriculum=none"])["curriculum"]
 
 
 def test_the_study_has_24_parts_by_three_seeds() -> None:

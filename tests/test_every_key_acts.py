@@ -130,6 +130,7 @@ NEEDS = {
     },
     "reward/paper": ["schedule=none"],  # which sets three of its weights
     "curriculum/terrain_level": ["terrain=rough"],
+    "curriculum/hard_start": ["terrain=rough"],
     "critic/terrain": ["terrain=rough"],
     **{f"estimator/{name}": ["critic=privileged"] for name in ("none", "decoder")},
     "experiment/clock": [  # it changes what these say
