@@ -149,7 +149,7 @@ def test_weights_fit_no_run_with_another_estimator(trained: Path) -> None:
     from go1exp.train.policy import read_weights
 
     other = parse_train(compose("train", [*SMALL, "observation=history", "critic=privileged", "ppo.symmetry=true"]))
-    with pytest.raises(ConfigError, match="estimator.latent is 0 here and 32 there"):
+    with pytest.raises(ConfigError, match=r"estimator\.latent is 0 here and 32 there"):
         read_weights(other, trained)
 
 
