@@ -76,8 +76,8 @@ def _stand_on(core: Go1Core, row: int, column: int, kind: str) -> None:
     core.reset()
     core.level.fill_(row)
     core.tile_column.fill_(column)
-    whither = " towards its middle, where the robot begins" if "_" in kind else ""
-    print(f"on tile [{row},{column}] of {core.terrain.config.rows} rows: {kind}{whither}", flush=True)
+    towards = " towards its middle, where the robot begins" if "_" in kind else ""
+    print(f"on tile [{row},{column}] of {core.terrain.config.rows} rows: {kind}{towards}", flush=True)
 
 
 def _ground(container: dict[str, object]) -> TerrainConfig | None:

@@ -232,7 +232,7 @@ def column_types(config: TerrainConfig) -> tuple[str, ...]:
 
 
 def lost_kinds(config: TerrainConfig) -> tuple[list[str], list[str]]:
-    """Return the kinds with a share that get no column, and those whose hardest tile is flat for all that."""
+    """Return the kinds with a share that get no column, and those whose hardest tile is flat although they have one."""
     types = column_types(config)
     shared = [kind for kind, share in zip(TILE_TYPES, config.shares, strict=True) if share]
     flat = [k for k in shared if k in types and not _tile(config, k, config.rows - 1, types.index(k)).any()]

@@ -49,17 +49,15 @@ def read_weights(config: TrainConfig, source: Path) -> Weights:
     """
     with plugins.restored():
         theirs = run_folder.read_parsed(source)
-    estimates = (
-        config.estimator.latent and theirs.estimator.latent
-    )  # the weight is of the loss, no part of the function
-    differ = [
+    both_estimate = config.estimator.latent and theirs.estimator.latent
+    differ = [  # all that the networks are built by; estimator.weight is of the loss
         f"{name} is {new} here and {old} there"
         for name, new, old in (
             ("observation", *(_inputs(c.task.observation) for c in (config, theirs))),
             ("critic", *(_inputs(c.task.critic) for c in (config, theirs))),
             ("ppo.hidden", list(config.ppo.hidden), list(theirs.ppo.hidden)),
             ("estimator.latent", config.estimator.latent, theirs.estimator.latent),
-            ("estimator.hidden", *(list(c.estimator.hidden) if estimates else None for c in (config, theirs))),
+            ("estimator.hidden", *(list(c.estimator.hidden) if both_estimate else None for c in (config, theirs))),
             ("ppo.activation", config.ppo.activation, theirs.ppo.activation),
         )
         if new != old

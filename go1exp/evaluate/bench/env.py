@@ -43,7 +43,7 @@ Subject = Callable[[], int]  # a piece of work to measure: does one unit and ret
 
 @dataclass(frozen=True)
 class Measured:
-    """How much is measured, and what is told of the progress."""
+    """How much is measured, and how progress is reported."""
 
     num_envs: int  # environments of a batch
     rounds: int
