@@ -112,23 +112,28 @@ def torque(log: Log) -> Iterator[Finding]:
         return
     # A torque near its limit is clipped, so that it says nothing about the scale.
     highest = np.full(len(log.joints), np.inf) if r.meta.tau_limit is None else 0.9 * np.array(r.meta.tau_limit)
-    most = log.samples(limits.TORQUE_LAG)
-    expected = []
-    for lag in range(0, most + 1, log.samples(0.002)):
-        late = slice(most - lag, len(tau) - lag)
-        expected += [command[late] - state[most:]] + ([command[late] - state[late]] if lag else [])
-    # expected[i] and tau have the same length: the first samples, without a command at the largest lag, are cut.
+    # The first samples, without a command at the largest lag, are cut.
+    most, count = log.samples(limits.TORQUE_LAG), len(tau)
     tau, on = tau[most:], log.on[most:, None]
     on = on & (np.abs(tau) < highest)
-    usable = [on & (np.abs(e) < highest) for e in expected]
-    match = np.array([_masked_correlation(e, tau, use) for e, use in zip(expected, usable, strict=True)])
+
+    def expected(joints: int | slice, command_lag: int, state_lag: int) -> np.ndarray:
+        late, held = (slice(most - lag, count - lag) for lag in (command_lag, state_lag))
+        return command[late, joints] - state[held, joints]
+
+    lags = [(lag, held) for lag in range(0, most + 1, log.samples(0.002)) for held in sorted({0, lag})]
+    match = []
+    for pair in lags:  # one after another: all of them are many times the recording
+        shifted = expected(slice(None), *pair)
+        match.append(_masked_correlation(shifted, tau, on & (np.abs(shifted) < highest)))
+    best = np.argmax(np.abs(match), axis=0)
     for j, joint in enumerate(log.joints):
-        k = int(np.argmax(np.abs(match[:, j])))
-        reference = expected[k][:, j]
+        reference = expected(j, *lags[best[j]])
         blur, white = signals.noise(reference)
         if white and np.std(reference) < limits.MOTION * blur:
             continue
-        s = signals.scale(reference[usable[k][:, j]], tau[usable[k][:, j], j])
+        use = on[:, j] & (np.abs(reference) < highest[j])
+        s = signals.scale(reference[use], tau[use, j])
         if s and abs(s.correlation) >= limits.CLEARLY:
             yield from _scale_finding("scale", joint_channel("tau_est", joint), what, s, limits.TORQUE_SCALE)
 
