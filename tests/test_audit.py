@@ -772,13 +772,16 @@ def test_a_real_go1_snippet_is_sound() -> None:
     assert audit(imported("go1_walk_snippet")).flaws == []
 
 
-def trotting(order: tuple[int, ...] = tuple(range(12)), flip: int | None = None) -> Recording:
-    """Joints of a trot, legs in antiphase, under the PD law and a load that turns one joint against its target."""
+def trotting(
+    order: tuple[int, ...] = tuple(range(12)), flip: int | None = None, against: tuple[int, ...] = (2,)
+) -> Recording:
+    """Joints of a trot, legs in antiphase, under the PD law and a load that turns some joints against their targets."""
     t = made().t
     phase = np.repeat([0.0, np.pi, np.pi, 0.0], 3)
     target = NOMINAL_STANCE + 0.3 * np.sin(2 * np.pi * 2.0 * t[:, None] + phase)
     q = NOMINAL_STANCE + 0.27 * np.sin(2 * np.pi * 2.0 * (t[:, None] - 0.03) + phase)
-    q[:, 2] = NOMINAL_STANCE[2] - 0.24 * np.sin(2 * np.pi * 2.0 * t)
+    for j in against:
+        q[:, j] = NOMINAL_STANCE[j] - 0.24 * np.sin(2 * np.pi * 2.0 * t + phase[j])
     q += 0.03 * np.sin(2 * np.pi * 3.3 * t[:, None] + np.arange(12.0))
     qd = np.gradient(q, t, axis=0)
     tau = 20.0 * (target - q) - 0.5 * qd
@@ -790,6 +793,10 @@ def trotting(order: tuple[int, ...] = tuple(range(12)), flip: int | None = None)
 def test_a_joint_that_load_moves_against_its_target_has_no_flipped_sign() -> None:
     assert audit(trotting()).by_check("sign") == []
     assert {f.channel for f in audit(trotting(flip=5)).by_check("sign")} == {f"q_{JOINTS[5]}"}
+
+
+def test_two_legs_that_load_moves_against_their_targets_are_not_swapped() -> None:
+    assert audit(trotting(against=(1, 4))).by_check("order") == []
 
 
 def test_another_order_of_legs_in_antiphase_is_an_order_and_no_sign() -> None:

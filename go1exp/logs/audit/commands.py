@@ -30,9 +30,10 @@ def order_and_sign(log: Log) -> Iterator[Finding]:
         return
     target, q = _matches_inputs(log)
     match = _lagged_correlation(log, target, q)
-    partner = _other_order(log, match)
     # Weight moves a leg against its target; without a law that weight does not change, only a held base shows a sign.
     follows = _controller_law(log)
+    # In a trot a leg that goes against its target goes with that of the next; their torques tell whose target it is.
+    partner = {j: k for j, k in _other_order(log, match).items() if not (match[j, j] < 0 < follows[j])}
     against = (follows < 0) | (
         (follows == 0) & (np.diag(match) < -limits.CLEARLY) & (log.recording.meta.base == "fixed")
     )
