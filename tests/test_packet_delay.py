@@ -61,6 +61,14 @@ def test_delays_of_a_clock_that_slips_are_reported_with_a_note(share: float | No
     assert words is None or words in notes[0]
 
 
+def test_a_walk_without_an_estimate_is_reported_and_so_are_commands_that_were_cut() -> None:
+    velocity = {"mean": [0.5, 0.0, 0.0], "estimate_rmse": None, "tracking_rmse": [0.03, 0.02, 0.05], "distance": 2.0}
+    lines = summary_lines({"velocity": velocity, "commands_cut": {"x": 150, "y": 0, "yaw": 0}})
+    assert lines[0] == "true velocity +0.500 +0.000 +0.000 m/s over 2.0 m"
+    assert lines[2:] == ["note: commands beyond the ranges of training were limited: x in 150 cycles"]
+    assert summary_lines({"commands_cut": {"x": 0}}) == []
+
+
 def test_the_age_counts_from_the_measurement_less_the_fastest_way() -> None:
     way = PacketDelay()
     assert math.isnan(way.age(5.0, 1.0))

@@ -93,18 +93,19 @@ def packet_delays(log: Log) -> dict[str, Any] | None:
 
 
 def velocity_errors(log: Log, truth: Mapping[str, np.ndarray]) -> dict[str, Any] | None:
-    """Compare estimate and command with the truth, cycle by cycle while walking; None without either.
+    """Compare estimate and command with the truth, cycle by cycle while walking; None without truth.
 
     The truth is interpolated to the time of each cycle, less the latency of the fastest packet.
 
     Returns:
-        ``mean`` true velocity (3,), m/s in the trunk's frame; RMSE of the estimate, ``estimate_rmse`` (3,), and of the
-        walk against its command after a second, ``tracking_rmse``: x and y in m/s, yaw in rad/s; ``distance``, m.
+        ``mean`` true velocity (3,), m/s in the trunk's frame; RMSE of the estimate, ``estimate_rmse`` (3,), None where
+        a policy needs none; RMSE of the walk against its command after a second, ``tracking_rmse``: x and y in m/s, yaw
+        in rad/s; ``distance``, m.
     """
     arrived, clock = log.states.part("t"), log.states.part("clock")
     known = np.isfinite(clock)
     at = log.cycles.part("t")
-    walking = (log.cycles.part("phase") == PHASES.index("walking")) & np.isfinite(log.cycles.part("estimate")).all(1)
+    walking = log.cycles.part("phase") == PHASES.index("walking")
     if not known.any() or not walking.any() or not truth:
         return None
     newest = np.searchsorted(arrived[known], at[walking], "right") - 1
@@ -123,10 +124,12 @@ def velocity_errors(log: Log, truth: Mapping[str, np.ndarray]) -> dict[str, Any]
     true = np.column_stack([body[:, :2], then(truth["base_ang_vel_z_b"])])
     steady = at[walking] - at[walking][0] >= min(1.0, 0.5 * (at[walking][-1] - at[walking][0]))
     off = true[steady] - log.cycles.part("command")[walking][steady]
+    wrong = log.cycles.part("estimate")[walking] - body
+    wrong = wrong[np.isfinite(wrong).all(1)]
     place = np.stack([then(truth["base_pos_x_w"]), then(truth["base_pos_y_w"])], axis=1)
     return {
         "mean": body[steady].mean(axis=0).tolist(),
-        "estimate_rmse": np.sqrt(np.mean((log.cycles.part("estimate")[walking] - body) ** 2, axis=0)).tolist(),
+        "estimate_rmse": np.sqrt(np.mean(wrong**2, axis=0)).tolist() if len(wrong) else None,
         "tracking_rmse": np.sqrt(np.mean(off**2, axis=0)).tolist(),
         "distance": float(np.linalg.norm(place[-1] - place[0])),
     }
@@ -142,11 +145,15 @@ def summary_lines(content: Mapping[str, Any]) -> list[str]:
         )
     if velocity := content.get("velocity"):
         mean, rmse, off = (
-            " ".join(f"{value:+.3f}" if name == "mean" else f"{value:.3f}" for value in velocity[name])
+            " ".join(f"{value:+.3f}" if name == "mean" else f"{value:.3f}" for value in velocity[name] or ())
             for name in ("mean", "estimate_rmse", "tracking_rmse")
         )
-        lines.append(f"true velocity {mean} m/s over {velocity['distance']:.1f} m; RMSE of the estimate {rmse}")
+        estimate = f"; RMSE of the estimate {rmse}" if rmse else ""
+        lines.append(f"true velocity {mean} m/s over {velocity['distance']:.1f} m{estimate}")
         lines.append(f"RMSE against the command: x, y {off.rsplit(' ', 1)[0]} m/s, yaw {off.rsplit(' ', 1)[1]} rad/s")
+    if cut := {axis: count for axis, count in content.get("commands_cut", {}).items() if count}:
+        times = ", ".join(f"{axis} in {count} cycles" for axis, count in cut.items())
+        lines.append(f"note: commands beyond the ranges of training were limited: {times}")
     if packets := content.get("packets"):
         delay, age = (
             ", ".join(f"{name} {1e3 * value:.1f}" for name, value in packets[part].items()) for part in ("delay", "age")
