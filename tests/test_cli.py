@@ -187,7 +187,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("list reward rand", ("rand: not a setting, which is key=value; see go1exp list --help",)),
         ("train --config-dir nowhere reward=x", ("no such folder",)),
         ("train schedule=papr", ("schedule=papr: unknown choice of schedule 'papr'; did you mean 'paper'?",)),
-        ("eval reward=paper", ("reward=paper: no such key 'reward'; see --help",)),
+        ("eval reward=paper", ("reward=paper: no such key 'reward'; reward is a group of train; see --help",)),
         ("eval policy=papr", ("policy: unknown shipped policy 'papr'; did you mean 'paper'?",)),
         ("eval run=.", ("run = '.': not a run folder (it has no config.yaml)",)),
         ("play policy=paper out=x.xyz", ("out = 'x.xyz': a clip is .mp4 or .gif",)),
@@ -239,6 +239,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("train resume=nowhere terrain.stair_rise=[0,1]", ("stair_rise=[0,1]: a resumed run keeps its configuration",)),
         ("train resume=nowhere curriculum.terrain_level.start_level_max=3", ("a resumed run keeps its configuration",)),
         ("train resume=nowhere checkpoint.evry=3", ("did you mean 'checkpoint.every'",)),
+        ("eval policy=rough terrain=steps", ("a group of gap loop, play, record, sim, train; train_ground=true or",)),
         # others
         (
             "fit-actuator recordings=nowhere inputs=[speed]",

@@ -349,6 +349,13 @@ def test_a_robot_comes_back_when_it_does(agent: PolicyAgent) -> None:
             "gait protocol.gait.commands=[[0.0,1e30,0.0]]",
             "protocol.gait.commands.0.1 = 1e+30: must be from -100 to 100",
         ),
+        (
+            "terrain protocol.terrain.grounds.stairs_up=[10,15]",
+            "grounds.stairs_up = [10.0, 15.0]: must rise, to at most 2 m",
+        ),
+        ("terrain protocol.terrain.grounds.slope_up=[10,95]", "must rise, to at most 60 deg"),
+        ("recover protocol.recover.stand.height=22", "protocol.recover.stand.height = 22: must be from 0 to 1 m"),
+        ("robogauge protocol.robogauge.grounds.waves.levels=[1,2,3,4,5,6,7,8,9,10,11]", "at most 10 items"),
         ("recover protocol.recover.stand.tilt=4.0", "protocol.recover.stand.tilt = 4.0"),
         ("recover protocol.recover.push.impulse=1e300", "must be from 0 to 500 N s"),
         ("recover protocol.recover.hold=[-1.0,1.0]", "protocol.recover.hold.0 = -1.0"),

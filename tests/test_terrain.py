@@ -75,6 +75,8 @@ def problems_of(change: dict) -> list[str]:
     ("change", "says"),
     [
         ({"kind": "stairs"}, "terrain.kind = 'stairs': input should be 'flat' or 'tiles'"),
+        ({"stair_rise": [0.1, 20.0]}, "terrain.stair_rise.1 = 20.0: must be from 0 to 2 m"),
+        ({"ramp_slope": [0.0, 25.0]}, "terrain.ramp_slope.1 = 25.0: must be from 0 to 2 (rise over run)"),
         ({"rows": 0}, "terrain.rows = 0: input should be greater than or equal to 1"),
         ({"cols": 2.5}, "terrain.cols = 2.5: input should be a valid integer"),
         ({"rows": True}, "terrain.rows = True: input should be a valid integer"),

@@ -21,6 +21,13 @@ OPEN = re.compile(r"model\.tolerances[.=]")
 """An override of a mapping to which a user may add keys; the verb checks them."""
 
 
+INSTEAD = {
+    ("eval", "terrain"): "train_ground=true or protocol=terrain walks on uneven ground",
+    ("eval", "rand"): "randomize=true randomises as in training",
+}
+"""What a verb has in place of a group of others."""
+
+
 def as_hydra_takes_them(overrides: Sequence[str]) -> list[str]:
     """Return overrides in a form that Hydra accepts, where it is stricter than our documents.
 
@@ -126,6 +133,10 @@ def _no_such_key(key: str, given: str, name: str, overrides: Sequence[str], fold
     ends = {k: k.rpartition(".")[2] for k in known} if parent else {}
     close = nearest(key, known) or [k for k, end in ends.items() if nearest(last, [end])]
     hint = f"did you mean {' or '.join(repr(c) for c in close[:3])}?" if close else "see --help"
+    verbs = sorted(file.stem for file in config_folder().glob("*.yaml") if group in groups_of(file.stem))
+    if verbs and name not in verbs:
+        instead = INSTEAD.get((name, group), "see --help")
+        hint = f"{group} is a group of {', '.join(verbs).replace('_', ' ')}; {instead}"
     term, _, parameter = key.rpartition(".")
     others = [k.rpartition(".")[2] for k in known if k.startswith(f"{term}.")]
     if term.count(".") == 1 and others and given[0] not in "+~" and not nearest(parameter, others):

@@ -112,10 +112,7 @@ def evaluate(
     core = Go1Core(task, count, config.seed, noise=config.noise, imu=imu)
     act = agent.begin(core, config.trunk_velocity, config.seed)
     assert isinstance(core.command, FixedVelocity)
-    # Robot i has command i // episodes: the robots of one command are neighbours.
-    commands = torch.tensor(config.commands, dtype=torch.float32)
-    core.command.value.copy_(commands.repeat_interleave(config.episodes, 0))
-    _share_ground(core, config)
+    _share_out(core, config)
     observation = core.reset()
     draws = drawn(core)  # robots that fall are drawn anew
     tally = _Tally(count)
@@ -146,8 +143,10 @@ def evaluate(
     return report
 
 
-def _share_ground(core: Go1Core, config: EvalConfig) -> None:
-    """Give each command the same columns of tiles, of all kinds: else it is judged by what its robots stand on."""
+def _share_out(core: Go1Core, config: EvalConfig) -> None:
+    """Give robot i command i // episodes, and the robots of each command the same columns of tiles, of all kinds."""
+    commands = torch.tensor(config.commands, dtype=torch.float32)
+    core.command.value.copy_(commands.repeat_interleave(config.episodes, 0))
     columns, each = len(core.terrain.tile_types), torch.arange(config.episodes)
     spread = each * columns // config.episodes if config.episodes < columns else each % columns
     core.tile_column.copy_(spread.repeat(len(config.commands)))

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, Field
 
-from go1exp.config.schema.registry import Count, CountOrZero, NonNegative, Positive, Strict, ordered
+from go1exp.config.schema.registry import Count, CountOrZero, NonNegative, Positive, Strict, ordered, within
 from go1exp.mdp.ground import GroundHeight
 
 TILE_TYPES = ("boxes", "bumps", "ramp_up", "ramp_down", "flat", "stairs_up", "stairs_down", "obstacles", "gaps")
@@ -34,6 +34,11 @@ GAP_DEPTH, GAP_SPACING = 0.5, 1.0
 FloatArray = NDArray[np.float64]
 
 NonNegativeRange = Annotated[tuple[NonNegative, NonNegative], AfterValidator(ordered)]
+# Centimetres and degrees are refused: no legged robot climbs 2 m or 63 degrees.
+Height = Annotated[NonNegative, within(0.0, 2.0, "m")]
+Slope = Annotated[NonNegative, within(0.0, 2.0, "(rise over run)")]
+HeightRange = Annotated[tuple[Height, Height], AfterValidator(ordered)]
+SlopeRange = Annotated[tuple[Slope, Slope], AfterValidator(ordered)]
 
 
 @dataclass(frozen=True)
@@ -95,15 +100,15 @@ class TerrainConfig(Strict):
     stairs_proportion: NonNegative = 0.0
     obstacles_proportion: NonNegative = 0.0
     gaps_proportion: NonNegative = 0.0
-    box_height: NonNegativeRange = (0.0, 0.1)
+    box_height: HeightRange = (0.0, 0.1)
     box_cell: Positive = 0.45
-    bump_amplitude: NonNegativeRange = (0.0, 0.06)
+    bump_amplitude: HeightRange = (0.0, 0.06)
     bump_length: Positive = 0.25
     bump_blend: NonNegative = 0.5
-    ramp_slope: NonNegativeRange = (0.0, 0.4)
-    stair_rise: NonNegativeRange = (0.0, 0.2)
+    ramp_slope: SlopeRange = (0.0, 0.4)
+    stair_rise: HeightRange = (0.0, 0.2)
     stair_tread: Positive = 0.3
-    obstacle_height: NonNegativeRange = (0.0, 0.2)
+    obstacle_height: HeightRange = (0.0, 0.2)
     gap_width: NonNegativeRange = (0.0, 0.4)
 
     def __post_init__(self) -> None:

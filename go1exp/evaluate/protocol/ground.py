@@ -7,7 +7,7 @@ vertical walls: a riser leans over one sample.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -22,6 +22,9 @@ GroundName = Literal[
 
 UNITS: dict[str, str] = {name: "deg" if name.startswith("slope") else "m" for name in get_args(GroundName)}
 """Of each ground's difficulty: angle; largest height of a grain, crest over trough, rise of a step, height of a box."""
+
+LARGEST = {"deg": 60.0, "m": 2.0}
+"""Difficulties beyond any legged robot's: a number in another unit is not taken for one."""
 
 RUN_UP, COURSE, RUN_OUT, WIDTH = 1.5, 5.0, 2.5, 5.0
 """m. The run-out is longer than the metre before the edge of the map at which an episode ends."""
@@ -75,6 +78,14 @@ def _obstacles(x: Field, y: Field, difficulty: float, course: float, rng: np.ran
     centre = [np.abs(v - c) <= 0.5 * CENTRE_BLOCK for v, c in ((across, middle), (along, 0.5 * course))]
     heights[np.ix_(*centre)] = 1.0
     return difficulty * heights
+
+
+def wrong_difficulties(key: str, ground: GroundName, levels: Sequence[float]) -> list[str]:
+    """Return what is wrong with the difficulties of a ground, named by their key: nothing, or one line."""
+    unit = UNITS[ground]
+    if sorted(set(levels)) == list(levels) and levels[-1] <= LARGEST[unit]:
+        return []
+    return [f"{key} = {list(levels)}: must rise, to at most {LARGEST[unit]:g} {unit}"]
 
 
 def _inside(x: Field, course: float) -> Field:

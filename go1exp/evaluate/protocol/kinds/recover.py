@@ -13,7 +13,7 @@ from pydantic import Field
 
 from go1exp import robot
 from go1exp.base.report import plots
-from go1exp.config.schema.registry import Gain, NonNegative, Positive, protocol
+from go1exp.config.schema.registry import Gain, NonNegative, Positive, protocol, within
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, lives
 from go1exp.evaluate.protocol.plan import NEVER, Array, Brake, Braking, Impulse, Impulses, Plan, Signal
@@ -41,7 +41,7 @@ class Stand:
         hold_s: time for which both must hold, s.
     """
 
-    height: Positive
+    height: Annotated[Positive, within(0.0, 1.0, "m")]
     tilt: Tilt
     hold_s: Positive
 

@@ -33,7 +33,7 @@ from go1exp.config.schema.registry import NonNegative, Positive, bind_list, prot
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, repeated
 from go1exp.evaluate.protocol.grading import CHANNELS, METRICS, Graded, Subtask, channels, highest_level, score
-from go1exp.evaluate.protocol.ground import GroundName, Lanes
+from go1exp.evaluate.protocol.ground import GroundName, Lanes, wrong_difficulties
 from go1exp.evaluate.protocol.kinds.rate import LATEST_MS
 from go1exp.evaluate.protocol.plan import NEVER, Array, Plan
 from go1exp.evaluate.quantities import (
@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from go1exp.evaluate.protocol.stage import Stage
 
 FLAT = "flat"
+MOST_LEVELS = 10  # at which the published score reaches 1
 LEVEL = "level_"  # first part of the names of the columns with whether a robot passed a level, 1 for the first
 STEER = (1.5, 0.5)  # yaw rate with which a robot is turned back, per rad of heading and per m beside its lane
 PATCH, PATCH_WIDTH = 13.0, 14.0  # length and width of the ground on which commands are followed, m: 5 m to each side
@@ -68,7 +69,7 @@ class Assessed:
 
     Attributes:
         lane: its kind.
-        levels: difficulty of each level, rising: degrees of slopes, metres of all others.
+        levels: difficulty of each level, rising, at most ten: degrees of slopes, metres of all others.
         course: length, m.
         speed: commanded speed along it, m/s.
         seconds: time for it, s.
@@ -76,7 +77,7 @@ class Assessed:
     """
 
     lane: GroundName
-    levels: Annotated[tuple[NonNegative, ...], Field(min_length=1)]
+    levels: Annotated[tuple[NonNegative, ...], Field(min_length=1, max_length=MOST_LEVELS)]
     course: Annotated[float, Field(gt=0, le=100)]
     speed: Annotated[float, Field(gt=0, le=100)]
     seconds: Positive
@@ -131,8 +132,7 @@ class RoboGauge(Protocol):
     def __post_init__(self) -> None:
         wrong = repeated("frictions", self.frictions)
         for name, one in self.assessed.items():
-            if sorted(set(one.levels)) != list(one.levels):
-                wrong.append(f"grounds.{name}.levels = {list(one.levels)}: must rise")
+            wrong += wrong_difficulties(f"grounds.{name}.levels", one.lane, one.levels)
         if FLAT in self.grounds:
             wrong.append(f"grounds.{FLAT}: has no levels and is always played; choose another name")
         if wrong:

@@ -13,7 +13,7 @@ from go1exp.base.report import plots
 from go1exp.config.schema.registry import NonNegative, PositiveRange, Speed, protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Cause, Length, Played, Protocol, lives, repeated
-from go1exp.evaluate.protocol.ground import GOAL, UNITS, GroundName, Lanes
+from go1exp.evaluate.protocol.ground import GOAL, UNITS, GroundName, Lanes, wrong_difficulties
 from go1exp.evaluate.protocol.plan import Motion, Plan
 from go1exp.evaluate.quantities import Column, Derived, Row, Summaries, Summary, values
 from go1exp.evaluate.statistics.intervals import Logistic, logistic_fit
@@ -60,11 +60,8 @@ class OnTerrain(Protocol):
     )
 
     def __post_init__(self) -> None:
-        wrong = [
-            f"grounds.{name} = {list(levels)}: must rise"
-            for name, levels in self.ladders.items()
-            if sorted(set(levels)) != list(levels)
-        ]
+        ladders = self.ladders.items()
+        wrong = [line for name, levels in ladders for line in wrong_difficulties(f"grounds.{name}", name, levels)]
         wrong += repeated("speeds", self.speeds)
         if not self.ladders:
             wrong = ["grounds: at least one is needed"]
