@@ -238,7 +238,7 @@ class FakePolicy:
     """Answers with its command, as an action for every joint."""
 
     sizes = {"base_lin_vel_b": 3, "command": 3, "walked": 1}  # noqa: RUF012
-    sizes |= dict.fromkeys(("joint_pos", "previous_action", "earlier_action"), 12)
+    sizes |= dict.fromkeys(("joint_pos", "previous_action", "lowest_action", "highest_action"), 12)
     inputs = tuple(Port(name, size, "", "", "") for name, size in sizes.items())
 
     def __init__(self) -> None:
@@ -350,14 +350,16 @@ def test_the_estimator_gets_every_state_once_and_the_policy_the_newest_estimate(
     assert [readings["base_lin_vel_b"][0, 0] for readings in made.policy.calls] == [5.0 * k for k in range(11, 21)]
 
 
-def test_at_another_rate_the_policy_gets_the_mean_action_of_a_training_period_and_the_one_before_it() -> None:
-    made = controller(commands=lambda t: np.array([1.0 + t, 0.0, 0.0]), rate=100.0)  # 4 cycles in a training period
+def test_at_another_rate_the_policy_gets_mean_lowest_and_highest_action_of_a_training_period() -> None:
+    waving = lambda t: np.array([np.sin(40.0 * t), 0.0, 0.0])  # noqa: E731
+    made = controller(commands=waving, rate=100.0)  # 4 cycles in a training period
     made.run_cycles(30)
     actions = [float(readings["command"][0, 0]) for readings in made.policy.calls]  # what ``FakePolicy`` answers with
     previous = [float(readings["previous_action"][0, 0]) for readings in made.policy.calls]
-    np.testing.assert_allclose(previous, [sum(actions[max(k - 4, 0) : k]) / 4 for k in range(len(actions))], rtol=1e-6)
-    earlier = [float(readings["earlier_action"][0, 0]) for readings in made.policy.calls]
-    np.testing.assert_array_equal(earlier, [*[0.0] * 4, *actions[:-4]])
+    periods = [([0.0] * 4 + actions)[k : k + 4] for k in range(len(actions))]
+    np.testing.assert_allclose(previous, np.mean(periods, axis=1), rtol=1e-5, atol=1e-6)
+    for name, of in (("lowest_action", np.min), ("highest_action", np.max)):
+        np.testing.assert_array_equal([float(r[name][0, 0]) for r in made.policy.calls], of(periods, axis=1))
 
 
 def test_a_rehearsal_leaves_no_trace() -> None:

@@ -214,20 +214,22 @@ def test_at_another_rate_the_previous_action_is_the_mean_over_a_training_period(
 
 
 @pytest.mark.parametrize(("policy_dt", "cycles"), [(None, 1), (0.01, 2), (0.004, 5)])
-def test_a_target_changes_by_no_more_than_the_bound_in_a_training_period_at_any_rate(
+def test_targets_of_a_training_period_differ_by_no_more_than_the_bound_at_any_rate(
     task: TaskConfig, policy_dt: float | None, cycles: int
 ) -> None:
-    where, observed = columns(task, "previous_action"), []
+    where, observed = columns(task, "previous_action"), list[float]()
     task = dataclasses.replace(task, action=dataclasses.replace(task.action, max_step=0.1 * task.action.scale))
+    wanted = (0.3 * np.random.default_rng(0).normal(size=60)).tolist()
 
     def policy(observation: torch.Tensor) -> torch.Tensor:
         observed.append(float(observation[0, where].mean()))
-        return torch.full((len(observation), 12), 0.25)
+        return torch.full((len(observation), 12), wanted[len(observed) - 1])
 
     evaluate(task, policy, settings(seconds=0.2, settle_s=0.0, policy_dt=policy_dt))
     actions, means = [0.0] * cycles, [0.0]
-    for _ in observed:
-        actions.append(min(0.25, actions[-cycles] + 0.1))
+    for want in wanted[: len(observed)]:
+        actions.append(float(np.clip(want, max(actions[-cycles:]) - 0.1, min(actions[-cycles:]) + 0.1)))
+        assert np.ptp(actions[-cycles - 1 :]) < 0.1 + 1e-9
         means.append(sum(actions[-cycles:]) / cycles)
     assert observed == pytest.approx(means[: len(observed)], abs=1e-6)
 

@@ -133,7 +133,7 @@ def test_torch_onnx_and_the_environment_agree(choice: str, max_step: str, make_t
         core.step(wanted)
         action = wanted.clamp(-2.0, 2.0)
         if task.action.max_step is not None:
-            step, before = task.action.max_step / task.action.scale, given["earlier_action"]
+            step, before = task.action.max_step / task.action.scale, given["lowest_action"]
             action = torch.minimum(torch.maximum(action, before - step), before + step)
         target = torch.as_tensor(robot.NOMINAL_STANCE, dtype=torch.float32) + task.action.scale * action
         expected = {"joint_target": target, "observation": observed, "action": action}
@@ -262,7 +262,7 @@ def test_a_missing_runtime_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_every_source_is_a_field_and_every_reading_is_given(start_core: Callable[..., Go1Core]) -> None:
     assert set(graph.SOURCES) <= {f.name for f in dataclasses.fields(Snapshot)}
     names = [port.name for port in graph.READINGS]
-    assert {*graph.SOURCES.values(), graph.EARLIER} == set(names)
+    assert {*graph.SOURCES.values(), *graph.BOUNDING} == set(names)
     core = start_core(num_envs=2)
     given = readings(core)
     assert {name: values.shape[1] for name, values in given.items()} == {p.name: p.size for p in graph.READINGS}

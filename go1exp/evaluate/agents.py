@@ -162,7 +162,9 @@ class _RunningPolicy:
         observation[:, history.earlier] = observation[:, history.newest] if self._earlier is None else self._earlier
         action = self._policy(observation)
         if self._actions.cycles > 1:  # else the environment limits it
-            action = limited(action, self._actions.earlier(torch.zeros_like(action)), *self._limits)
+            nothing = torch.zeros_like(action)
+            lowest, highest = (self._actions.extreme(of, nothing) for of in (torch.minimum, torch.maximum))
+            action = limited(action, lowest, *self._limits, highest)
             self._actions.add(action)
         self._frames.add(observation[:, history.carried])
         self._earlier = self._frames.earlier(observation[:, history.earlier])

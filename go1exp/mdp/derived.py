@@ -66,17 +66,20 @@ def clock_angle(s: Snapshot, rate: float) -> Tensor:
     return 2.0 * math.pi * (rate * s.episode_time).frac()
 
 
-def limited(action: Tensor, previous: Tensor, clip: float, step: float | None) -> Tensor:
+def limited(action: Tensor, previous: Tensor, clip: float, step: float | None, highest: Tensor | None = None) -> Tensor:
     """Return the action in force (N, 12), which the policy observes as its last one, for a policy's output.
 
     Args:
         action: the output.
-        previous: the action in force before.
+        previous: the action in force before; the lowest of several, if ``highest`` is given.
         clip: bound of an action.
-        step: bound of its change; None for none.
+        step: bound of its change from each of them; None for none.
+        highest: the highest of several, which differ by at most ``step``.
     """
     action = action.clamp(-clip, clip)
-    return action if step is None else previous + (action - previous).clamp(-step, step)
+    if step is None:
+        return action
+    return torch.maximum(torch.minimum(action, previous + step), (previous if highest is None else highest) - step)
 
 
 def of_shape(action: Tensor, shape: tuple[int, ...]) -> Tensor:

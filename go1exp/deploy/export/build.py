@@ -53,7 +53,8 @@ def readings(core: Go1Core) -> dict[str, Tensor]:
         "joint_target": s.joint_target,
         "command": s.command,
         "previous_action": s.action,
-        "earlier_action": s.action,
+        "lowest_action": s.action,
+        "highest_action": s.action,
         "walked": s.episode_time.unsqueeze(-1),
     }
     return {name: values.float().clone() for name, values in current.items()}

@@ -47,7 +47,8 @@ READINGS = (
     Port("joint_target", J, "rad", "joint", "present position targets; the nominal stance at the start"),
     Port("command", 3, "m/s, m/s, rad/s", "trunk", "commanded velocity: x, y and yaw rate"),
     Port("previous_action", J, "1", "joint", "mean of the output `action` over the last training period; 0 at first"),
-    Port("earlier_action", J, "1", "joint", "output `action` one training period ago; 0 at first"),
+    Port("lowest_action", J, "1", "joint", "lowest output `action` of the last training period; 0 before the first"),
+    Port("highest_action", J, "1", "joint", "highest output `action` of the last training period; 0 before the first"),
     Port("walked", 1, "s", "-", "time since walking began: a gait clock is a function of it"),
 )
 """Inputs that the robot's computer can provide. A graph has those that its terms read, in this order."""
@@ -67,8 +68,8 @@ SOURCES = {
 }
 """Field of the Snapshot -> the reading that it is computed from. The robot does not measure the other fields."""
 
-EARLIER = "earlier_action"
-"""Reading that the change of an action is bounded from."""
+BOUNDING = ("lowest_action", "highest_action")
+"""Readings that the change of an action is bounded from: no two actions of a training period differ by more."""
 
 LAWS: dict[str, Callable[[Tensor], Tensor]] = {
     "projected_gravity_b": projected_gravity,
@@ -134,7 +135,7 @@ def required_inputs(terms: Sequence[Term], action: ActionConfig | None = None) -
     Raises:
         ExportError: if a term reads what the robot does not measure, or remembers the past.
     """
-    read: set[str] = set() if action is None or action.max_step is None else {EARLIER}
+    read: set[str] = set() if action is None or action.max_step is None else {*BOUNDING}
     for term in terms:
         if term.entry.remembers:
             raise ExportError(
@@ -205,8 +206,8 @@ class DeployedPolicy(Observing):
         """Return joint targets (N, 12), observation (N, O) and action in force (N, 12) for readings (N, size)."""
         given = self._named(readings)
         observation = self._flat([computed(term, given) for term in self._terms], given)
-        previous = given.get(EARLIER, observation)  # none is needed where no change is bounded
-        action = limited(self.head(self.actor(observation)), previous, *self._action.limits)
+        lowest, highest = (given.get(name, observation) for name in BOUNDING)  # none where no change is bounded
+        action = limited(self.head(self.actor(observation)), lowest, *self._action.limits, highest)
         return joint_target(action, self.nominal, self._action.scale), observation, action
 
 

@@ -248,8 +248,9 @@ def _check_action(trace: Mapping[str, np.ndarray], metadata: Metadata, source: s
     if not float(np.max(np.abs(action))) <= metadata.action_clip + TOLERANCE:
         raise BundleError(f"{source}: {METADATA}: action_clip is not that of the trace")
     if metadata.action_max_step is not None:
-        change = metadata.action_scale * (action - trace.get("input.earlier_action", np.inf))
-        if not float(np.max(np.abs(change))) <= metadata.action_max_step + TOLERANCE:
+        bounding = (trace.get(f"input.{name}_action", np.inf) for name in ("lowest", "highest"))
+        change = metadata.action_scale * np.stack([np.abs(action - one) for one in bounding])
+        if not float(np.max(change)) <= metadata.action_max_step + TOLERANCE:
             raise BundleError(f"{source}: {METADATA}: action_max_step is not that of the trace")
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from functools import reduce
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
@@ -124,6 +125,10 @@ class Past(Generic[A]):
         """Return the value of one training period before the next cycle, ``before`` if there is none."""
         return before if len(self._kept) < self.cycles else self._kept[0]
 
+    def extreme(self, of: Callable[[A, A], A], before: A) -> A:
+        """Return the lowest or highest of the last training period, by ``of`` two; ``before`` precedes the first."""
+        return reduce(of, self._kept, before) if len(self._kept) < self.cycles else reduce(of, self._kept)
+
     def mean(self) -> A:
         """Return the mean over the last training period, with 0 before the first value.
 
@@ -132,8 +137,11 @@ class Past(Generic[A]):
         return sum(self._kept) / self.cycles
 
 
+REMEMBERED = ("previous_action", "lowest_action", "highest_action", "past")
+
+
 class PolicyMemory:
-    """Runs a policy and keeps its inputs ``previous_action``, ``earlier_action`` and ``past`` for the next cycle.
+    """Runs a policy and keeps those of its inputs that are of earlier cycles (``REMEMBERED``) for the next one.
 
     Attributes:
         values: those of these inputs that the policy has, by name, float32 (rows, size).
@@ -143,9 +151,7 @@ class PolicyMemory:
         """Start an episode of ``rows`` robots; ``period`` is the present one of the policy, s."""
         sizes = {port.name: port.size for port in about.inputs}
         self.values: dict[str, np.ndarray] = {
-            name: np.zeros((rows, sizes[name]), np.float32)
-            for name in ("previous_action", "earlier_action", "past")
-            if name in sizes
+            name: np.zeros((rows, sizes[name]), np.float32) for name in REMEMBERED if name in sizes
         }
         self._columns = columns_of((block.size // block.history, block.history) for block in about.observation)
         self._actions = Past[np.ndarray](about.policy_dt, period)
@@ -164,8 +170,10 @@ class PolicyMemory:
         self._actions.add(outputs["action"])
         if "previous_action" in self.values:
             self.values["previous_action"] = self._actions.mean()
-        if "earlier_action" in self.values:
-            self.values["earlier_action"] = self._actions.earlier(self.values["earlier_action"])
+        if "lowest_action" in self.values:
+            nothing = np.zeros_like(outputs["action"])
+            self.values["lowest_action"] = self._actions.extreme(np.minimum, nothing)
+            self.values["highest_action"] = self._actions.extreme(np.maximum, nothing)
         if self._first is not None:
             self._frames.add(outputs["observation"][:, self._columns.carried])
             self.values["past"] = self._frames.earlier(self._first)
