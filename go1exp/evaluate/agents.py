@@ -163,7 +163,7 @@ class _RunningPolicy:
         action = self._policy(observation)
         if self._actions.cycles > 1:  # else the environment limits it
             nothing = torch.zeros_like(action)
-            lowest, highest = (self._actions.extreme(of, nothing) for of in (torch.minimum, torch.maximum))
+            lowest, highest = (self._actions.extreme(rule, nothing) for rule in (torch.minimum, torch.maximum))
             action = limited(action, lowest, *self._limits, highest)
             self._actions.add(action)
         self._frames.add(observation[:, history.carried])

@@ -125,9 +125,9 @@ class Past(Generic[A]):
         """Return the value of one training period before the next cycle, ``before`` if there is none."""
         return before if len(self._kept) < self.cycles else self._kept[0]
 
-    def extreme(self, of: Callable[[A, A], A], before: A) -> A:
-        """Return the lowest or highest of the last training period, by ``of`` two; ``before`` precedes the first."""
-        return reduce(of, self._kept, before) if len(self._kept) < self.cycles else reduce(of, self._kept)
+    def extreme(self, rule: Callable[[A, A], A], before: A) -> A:
+        """Return the lowest or highest of the last training period, by a rule of two; ``before`` precedes the first."""
+        return reduce(rule, self._kept, before) if len(self._kept) < self.cycles else reduce(rule, self._kept)
 
     def mean(self) -> A:
         """Return the mean over the last training period, with 0 before the first value.
