@@ -399,14 +399,8 @@ def test_commands_are_compared_on_the_same_kinds_of_ground(
         return {}
 
     monkeypatch.setattr(rollout, "drawn", drawn)
-    config = dataclasses.replace(
-        QUIET, commands=((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), episodes=episodes, train_ground=True
-    )
-    evaluate(
-        task,
-        lambda observation: torch.zeros(len(observation), 12),
-        dataclasses.replace(config, seconds=0.1, settle_s=0.0),
-    )
+    config = dataclasses.replace(QUIET, episodes=episodes, train_ground=True, seconds=0.1, settle_s=0.0)
+    evaluate(task, lambda observation: torch.zeros(len(observation), 12), config)
     assert seen == [expected * 2]
 
 

@@ -145,6 +145,12 @@ def test_torch_onnx_and_the_environment_agree(choice: str, max_step: str, make_t
             np.testing.assert_allclose(by_torch[name].detach(), values, rtol=0, atol=1e-5, err_msg=name)
             np.testing.assert_allclose(by_onnx[name], values, rtol=0, atol=1e-5, err_msg=name)
         assert (action.abs() == 2.0).any()  # or the cut was not tried
+        if task.action.max_step is not None:  # lowest and highest differ between two training periods
+            named["highest_action"] = named["lowest_action"] + 0.5 * step
+            wanted = wanted.clamp(-2.0, 2.0)
+            action = torch.minimum(torch.maximum(wanted, before - 0.5 * step), before + step)
+            found = session({name: values.numpy() for name, values in named.items()})["action"]
+            np.testing.assert_allclose(found, action, rtol=0, atol=1e-5)
         if effects:
             assert (given["joint_pos"] - core.snapshot().joint_pos).abs().max() > 1e-3
 

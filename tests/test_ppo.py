@@ -284,7 +284,7 @@ def test_an_iteration_reports_once_when_its_update_is_complete() -> None:
     assert seen == [(1, 64, 2), (2, 128, 4), (3, 192, 6)]
 
 
-def test_a_learner_that_nobody_holds_any_more_is_freed() -> None:
+def test_a_learner_that_is_no_longer_referenced_is_freed() -> None:
     ppo = slider_ppo()
     learn(ppo, 1)
     held = weakref.ref(ppo)

@@ -76,7 +76,7 @@ def _stand_on(core: Go1Core, row: int, column: int, kind: str) -> None:
     core.reset()
     core.level.fill_(row)
     core.tile_column.fill_(column)
-    towards = " towards its middle, where the robot begins" if "_" in kind else ""
+    towards = " towards its middle, where the robot begins" if kind.endswith(("_up", "_down")) else ""
     print(f"on tile [{row},{column}] of {core.terrain.config.rows} rows: {kind}{towards}", flush=True)
 
 

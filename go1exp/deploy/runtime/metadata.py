@@ -82,7 +82,7 @@ class Metadata:
         conventions: description of frames, quaternions and signs.
         estimator: settings of the state estimator (``deploy.estimation.FilterConfig`` as JSON); empty: those of a Go1.
         trained: the policy's origin.
-        action_max_step: largest change of a target in ``policy_dt`` (from all before it), rad; None for any.
+        action_max_step: largest difference of two targets within ``policy_dt``, rad; None for any.
     """
 
     robot: str

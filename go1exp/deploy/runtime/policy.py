@@ -126,7 +126,10 @@ class Past(Generic[A]):
         return before if len(self._kept) < self.cycles else self._kept[0]
 
     def extreme(self, rule: Callable[[A, A], A], before: A) -> A:
-        """Return the lowest or highest of the last training period, by a rule of two; ``before`` precedes the first."""
+        """Return the lowest or highest value of the last training period; ``before`` counts until there is a whole one.
+
+        ``rule`` takes two values, as ``np.minimum`` and ``torch.maximum`` do.
+        """
         return reduce(rule, self._kept, before) if len(self._kept) < self.cycles else reduce(rule, self._kept)
 
     def mean(self) -> A:

@@ -124,12 +124,12 @@ def velocity_errors(log: Log, truth: Mapping[str, np.ndarray]) -> dict[str, Any]
     true = np.column_stack([body[:, :2], then(truth["base_ang_vel_z_b"])])
     steady = at[walking] - at[walking][0] >= min(1.0, 0.5 * (at[walking][-1] - at[walking][0]))
     off = true[steady] - log.cycles.part("command")[walking][steady]
-    wrong = log.cycles.part("estimate")[walking] - body
-    wrong = wrong[np.isfinite(wrong).all(1)]
+    errors = log.cycles.part("estimate")[walking] - body
+    errors = errors[np.isfinite(errors).all(1)]
     place = np.stack([then(truth["base_pos_x_w"]), then(truth["base_pos_y_w"])], axis=1)
     return {
         "mean": body[steady].mean(axis=0).tolist(),
-        "estimate_rmse": np.sqrt(np.mean(wrong**2, axis=0)).tolist() if len(wrong) else None,
+        "estimate_rmse": np.sqrt(np.mean(errors**2, axis=0)).tolist() if len(errors) else None,
         "tracking_rmse": np.sqrt(np.mean(off**2, axis=0)).tolist(),
         "distance": float(np.linalg.norm(place[-1] - place[0])),
     }

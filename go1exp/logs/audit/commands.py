@@ -32,7 +32,7 @@ def order_and_sign(log: Log) -> Iterator[Finding]:
     match = _lagged_correlation(log, target, q)
     # Weight moves a leg against its target; without a law that weight does not change, only a held base shows a sign.
     follows = _controller_law(log)
-    # In a trot a leg that goes against its target goes with that of the next; their torques tell whose target it is.
+    # In a trot a leg that load moves against its target moves with that of another; its torque tells which it follows.
     partner = {j: k for j, k in _other_order(log, match).items() if not (match[j, j] < 0 < follows[j])}
     against = (follows < 0) | (
         (follows == 0) & (np.diag(match) < -limits.CLEARLY) & (log.recording.meta.base == "fixed")
