@@ -62,6 +62,7 @@ def test_the_table_of_the_method_is_that_of_the_verb() -> None:
         (OSError(errno.EROFS, "Read-only file system", "a\nb\x1b"), 2, r"Read-only file system: a\nb\x1b"),
         (ConfigError(["a\nb = 1: wrong"]), 2, r"a\nb = 1: wrong"),
         (RuntimeError("Symlink loop from 'a'"), 2, "Symlink loop from 'a'"),
+        (ModuleNotFoundError(name="hydra"), 2, f"{sys.executable} has no package 'hydra'; activate the environment"),
         (MemoryError(), 1, "out of memory"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory"), 1, "out of memory: DefaultCPUAllocator: can't"),
         (KeyboardInterrupt(), 130, "stopped"),

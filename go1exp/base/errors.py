@@ -98,6 +98,9 @@ def explained(error: BaseException) -> tuple[int, str] | None:
         )
     if isinstance(error, RuntimeError) and str(error).startswith("Symlink loop from "):  # pathlib's, until Python 3.13
         return REFUSED, str(error)
+    if isinstance(error, ModuleNotFoundError) and error.name and "." not in error.name:
+        hint = "activate the environment that go1exp is installed in, or install it in this one"
+        return REFUSED, f"{sys.executable} has no package {error.name!r}; {hint}"
     of_torch = type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in str(error)
     if isinstance(error, MemoryError) or of_torch:
         return FAILED, f"out of memory: {' '.join(str(error).split())}".rstrip(": ")
