@@ -27,7 +27,7 @@ Train = Callable[..., Any]
 
 
 def train_here(run: Path, *overrides: str, source: Path | None = None) -> Any:
-    container = compose("train", [*SMALL, *overrides])
+    container = compose("train", [*SMALL, *overrides, *([f"start_from={source}"] if source else [])])
     config = parse_train(container)
     run_folder.write(run, container)
     return trainer.train(config, container, run, policy.read_weights(config, source) if source else None)
@@ -68,6 +68,11 @@ def test_the_weights_are_the_others_and_all_else_is_new(
     file = first / "checkpoints" / told.pop("checkpoint")
     assert told.pop("sha256") == hashlib.sha256(file.read_bytes()).hexdigest()
     assert told == {"run": str(first), "iteration": 1, "num_timesteps": 16}
+
+
+def test_a_shipped_policy_is_the_origin_by_its_name() -> None:
+    config = parse_train(compose("train", ["experiment=rough_climb", "start_from=rough"]))
+    assert policy.read_weights(config, shipped_policies()["rough"]).about["run"] == "rough"
 
 
 def test_steps_are_counted_from_the_first_of_the_runs(first: Path, tmp_path: Path) -> None:

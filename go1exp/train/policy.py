@@ -66,7 +66,7 @@ def read_weights(config: TrainConfig, source: Path) -> Weights:
         raise ConfigError([f"start_from = {str(source)!r}: its weights fit no policy of this run: {'; '.join(differ)}"])
     state, path = checkpoint.load_latest(source)
     about = {
-        "run": str(source),
+        "run": config.process.start_from or str(source),  # as given: a shipped policy by its name
         "checkpoint": path.name,
         "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
         "iteration": state["iteration"],
