@@ -268,3 +268,38 @@ def test_a_recorded_gradient_step_is_the_called_one_and_goes_on_from_a_checkpoin
         torch.testing.assert_close(recorded[name], value, rtol=1e-4, atol=1e-6, msg=name)
     for name, values in other_figures.items():
         assert its_figures[name] == pytest.approx(values, rel=1e-3, abs=1e-5), name
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no CUDA device")
+def test_tf32_rounds_the_update_alone_and_by_little() -> None:
+    """Of one rollout and order: another result than in float32, nearby; products outside stay float32."""
+    wide = [o for o in (*SMALL, "backend=warp", "ppo.num_envs=64", "ppo.hidden=[256,128]") if "threads" not in o]
+    ppos: list[Any] = []
+    for precision in ("highest", "tf32"):
+        config = parse_train(compose("train", [*wide, f"ppo.matmul_precision={precision}"]))
+        ppos.append(DevicePPO(config.ppo, Go1VecEnv(Go1Core(config.task, config.ppo.num_envs, 0)), 0, "cuda"))
+    first, other = ppos
+    first.learn(64 * 6)
+    product = torch.arange(65536.0, device="cuda").sqrt().reshape(256, 256)
+    before, results = product @ product, []
+    state, data = checkpoint._state(first), first.rollout_buffer.data
+    for ppo in (first, other):
+        checkpoint.restore(ppo, state)
+        ppo.rollout_buffer.data = {name: value.clone() for name, value in data.items()}
+        ppo._update = DeviceUpdate(ppo, ppo.rollout_buffer, captures=True)
+        torch.manual_seed(2)
+        ppo._update(0.0)
+        results.append(torch.cat([p.detach().flatten() for p in ppo.policy.parameters()]))
+    assert torch.equal(before, product @ product)
+    assert not torch.equal(*results)
+    torch.testing.assert_close(*results, rtol=0.02, atol=2e-3)
+
+
+def test_on_the_cpu_tf32_is_float32() -> None:
+    weights = []
+    for precision in ("highest", "tf32"):
+        ppo = learner(DevicePPO, f"ppo.matmul_precision={precision}")
+        ppo.learn(48)
+        weights.append(torch.cat([p.detach().flatten() for p in ppo.policy.parameters()]))
+    assert torch.equal(*weights)

@@ -8,6 +8,7 @@ reads six numbers a minibatch back, which costs more than the arithmetic.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 
 import torch
 from stable_baselines3.common.type_aliases import RolloutBufferSamples
@@ -149,6 +150,7 @@ class DeviceUpdate:
         self._ended = torch.zeros((), dtype=torch.bool, device=device)
         self._on_gpu = device.type == "cuda"
         self._captures = captures and self._on_gpu
+        self._tf32 = c.matmul_precision == "tf32" and self._on_gpu
         self._step: Callable[[], None] | None = None
 
     def _build_averaged(self, device: torch.device) -> None:
@@ -169,14 +171,15 @@ class DeviceUpdate:
         if self._config.schedule == "linear":
             self._rate.fill_(scheduled_rate)
         self._old_log_std.copy_(self._policy.log_std.detach())
-        if self._step is None:
-            self._step = self._captured() if self._captures else self._gradient_step
-        self._position.zero_()
-        self._ended.zero_()
-        for _ in range(self._config.epochs):
-            for rows in self._buffer.minibatches(len(self._rows)):
-                self._rows.copy_(rows)
-                self._step()
+        with _rounded_factors(self._tf32):
+            if self._step is None:  # a graph keeps the precision of its recording
+                self._step = self._captured() if self._captures else self._gradient_step
+            self._position.zero_()
+            self._ended.zero_()
+            for _ in range(self._config.epochs):
+                for rows in self._buffer.minibatches(len(self._rows)):
+                    self._rows.copy_(rows)
+                    self._step()
         *figures, taken = self._figures.cpu().T
         return {name: values[taken > 0.0].tolist() for name, values in zip(FIGURES[:-1], figures, strict=True)}
 
@@ -275,6 +278,17 @@ class DeviceUpdate:
         with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
             work()
         return graph.replay
+
+
+@contextmanager
+def _rounded_factors(wanted: bool) -> Iterator[None]:
+    """Let a GPU round the factors of its matrix products to TF32 if ``wanted``; the environment keeps float32."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high" if wanted else before)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
 
 
 def _moments(state: Mapping[Tensor, dict[str, Tensor]]) -> list[Tensor]:

@@ -40,8 +40,9 @@ class PPOConfig(Strict):
         orthogonal_init: SB3's initial weights (gain sqrt(2), last layer of the actor 0.01); else PyTorch's, as rsl_rl.
         hidden: layers of actor and critic each.
         activation: nonlinearity between the layers.
-        matmul_precision: ``highest`` is float32; ``bf16`` runs the update's matrix products in bfloat16; ``auto`` is
-            ``bf16`` on a processor with units for it and ``highest`` on all others, which are much slower in it.
+        matmul_precision: of the update's matrix products. ``highest`` is float32; ``tf32`` rounds their factors to 10
+            bits on a GPU and is ``highest`` elsewhere; ``bf16`` is bfloat16; ``auto`` is ``bf16`` on a processor with
+            units for it and ``highest`` on all others, which are much slower in it.
         symmetry: join each minibatch with its mirror image, left for right (Mittal et al., arXiv 2403.04359).
         coarse_physics: physics step of the training over sim.physics_dt, which evaluations take. It is made shorter
             where it does not divide sim.policy_dt, and a net keeps its own period.
@@ -68,7 +69,7 @@ class PPOConfig(Strict):
     orthogonal_init: bool
     hidden: Annotated[tuple[Count, ...], Field(min_length=1)]
     activation: Literal["elu", "relu", "tanh"]
-    matmul_precision: Literal["highest", "bf16", "auto"]
+    matmul_precision: Literal["highest", "tf32", "bf16", "auto"]
     symmetry: bool = False  # runs of older versions do not have the key
     max_kl: Positive | None = None  # nor this one
     coarse_physics: Annotated[int, Field(ge=1, le=10_000)] = 1
