@@ -276,15 +276,15 @@ def test_tf32_rounds_the_update_alone_and_by_little() -> None:
     """Of one rollout and order: another result than in float32, nearby; products outside stay float32."""
     wide = [o for o in (*SMALL, "backend=warp", "ppo.num_envs=64", "ppo.hidden=[256,128]") if "threads" not in o]
     ppos: list[Any] = []
-    for precision in ("highest", "tf32"):
+    for precision in ("highest", "highest", "tf32"):
         config = parse_train(compose("train", [*wide, f"ppo.matmul_precision={precision}"]))
         ppos.append(DevicePPO(config.ppo, Go1VecEnv(Go1Core(config.task, config.ppo.num_envs, 0)), 0, "cuda"))
-    first, other = ppos
+    first, *others = ppos
     first.learn(64 * 6)
     product = torch.arange(65536.0, device="cuda").sqrt().reshape(256, 256)
     before, results = product @ product, []
     state, data = checkpoint._state(first), first.rollout_buffer.data
-    for ppo in (first, other):
+    for ppo in others:
         checkpoint.restore(ppo, state)
         ppo.rollout_buffer.data = {name: value.clone() for name, value in data.items()}
         ppo._update = DeviceUpdate(ppo, ppo.rollout_buffer, captures=True)
