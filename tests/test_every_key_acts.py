@@ -78,6 +78,7 @@ EXEMPT = {
     "controller/policy.yaml:controller": "the name of the choice",
     "experiment/ablation/*.yaml:schedule": "ramps that are taken away with their rows, or wait for another one",
     "experiment/rough.yaml:reward.foot_clock.excess": "of feet higher than asked, which come later: test_rewards",
+    "experiment/rough_climb.yaml:ppo.matmul_precision": "of a GPU: test_device_training",
     "experiment/rough_climb.yaml:reward.foot_clock": "of feet before a step, which come later: test_rewards",
     "reward/paper_literal.yaml:reward.air_time_variance.weight": "as printed, the term is zero for every gait",
     "launcher/*.yaml:launcher": "needs several cores, or a cluster: tests/test_sweeps.py, test_slurm.py",

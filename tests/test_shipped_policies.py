@@ -106,7 +106,7 @@ KNOWN_MISSES: dict[str, dict[tuple[float, ...], set[str]]] = {
     "paper": {},
     "robust": {(3.0, 0.0, 0.0): {"commanded 3.0 m/s", "RMSE yaw"}, (0.0, 0.0, 1.8): {"RMSE yaw"}},
     "robust_history": {(3.0, 0.0, 0.0): {"RMSE yaw"}},
-    "rough": {(1.0, 0.0, 0.0): {"touchdown speed"}, (3.0, 0.0, 0.0): {"RMSE yaw"}},
+    "rough": {(1.0, 0.0, 0.0): {"touchdown speed"}, (3.0, 0.0, 0.0): {"RMSE yaw", "commanded 3.0 m/s"}},
 }
 """Criteria of ``go1exp/evaluate/criteria.py`` that 20 robots under a policy miss, by command; no others."""
 
