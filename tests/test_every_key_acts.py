@@ -149,7 +149,12 @@ NEEDS = {
     "experiment/robust": ["experiment=clock", "backend=cpu"],
     "experiment/robust_history": ["experiment=robust", "backend=cpu"],
     "experiment/rough": ["experiment=robust_history", "terrain=steps", "observation=proprioception", "backend=cpu"],
-    "experiment/rough_climb": ["experiment=rough", "backend=cpu", "terrain.obstacles_proportion=0.6"],
+    "experiment/rough_climb": [
+        "experiment=rough",
+        "backend=cpu",
+        "terrain.obstacles_proportion=0.6",
+        "terrain.boxes_proportion=0.0",
+    ],
 }
 """Choices that other choices must go with."""
 
